@@ -188,6 +188,7 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
+        # a sample, whose motions are told apart
         across, up = evenly_spread(512).T
         finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
@@ -289,6 +290,7 @@ class _Finder:
             def work(some: Tips, impacts: int = impacts) -> Tips:
                 return _later(self.scene, some, impacts=impacts)
 
+            # pieces of usual width, some in a call
             tips = in_blocks(work, tips, block=8 * LANES)
             arrival, kinds = np.full(remaining.size, -1), kinds_of(tips.outcome)
             for number, orbit in enumerate(self.attractors):

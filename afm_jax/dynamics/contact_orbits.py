@@ -167,6 +167,7 @@ def _flown(
         jax.tree.map(lambda leaf: np.repeat(leaf[flies], count, axis=0), scenes),
         *(part.reshape(flies.size * count, *part.shape[2:]) for part in (unknowns[flies], until)),
     )
+    # of a few loops: one program for all numbers of contacts
     block, widths = (16, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
     results = in_blocks(lambda part: next_departures(*part, **settings), lanes, block=block, widths=widths)
     later, maps, contacts, there = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), results)

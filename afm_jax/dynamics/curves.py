@@ -40,6 +40,7 @@ class CurvePoint(NamedTuple):
 
 def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
+    # steps in phases in rad, speeds of the fastest impact, parameters of their ranges
     point = point_in_plane(family.linearised, guess, normal, Newton(rounds=12, step_tolerance=1e-11))
     return None if point is None else CurvePoint(point.x, point.tangent, *family.tests(point))
 
@@ -82,6 +83,7 @@ def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve |
     """Return the curve through a point, followed both ways; None where the point is none of a curve."""
     normals = np.eye(len(start))[-1], np.full(len(start), 1.0 / np.sqrt(len(start)))
     solved = (solved_point(start, normal, family) for normal in normals)
+    # farther away it is another orbit than the one that was found
     first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < 0.1), None)
     if first is None:
         return None
@@ -106,6 +108,7 @@ def _follow(begin: CurvePoint, family: LoopFamily) -> tuple[list[CurveLeg], str]
             np.linalg.norm(ahead.point - guess) < 0.3 * length and here.tangent @ ahead.tangent > _STRAIGHT
         ):
             length *= 0.5
+            # the shortest step
             if length < 1e-7:
                 return legs, "lost"
             continue
@@ -119,6 +122,7 @@ def _follow(begin: CurvePoint, family: LoopFamily) -> tuple[list[CurveLeg], str]
             return (legs if over == "capture" else legs[:-1]), over
         if len(legs) > 10 and _closes(ahead, begin, length, family):
             return legs, "closed"
+        # a straight curve has longer steps
         if here.tangent @ ahead.tangent > 0.998:
             length = min(1.5 * length, _LONGEST_STEP)
         here = ahead
@@ -134,6 +138,7 @@ def _why_over(
     # of a drive period: beyond, a law's delay has lost its meaning close to capture
     if point.delay > 0.5:
         return "delay"
+    # so near to a loop that repeats a shorter one it counts as that
     return "shorter" if unlike_shorter is not None and unlike_shorter(point) < 1e-3 else None
 
 

@@ -307,7 +307,7 @@ def _search(family: LawLoops, starts: Float[Array, "starts 2"], *, impacts: int)
     loops = jax.vmap(lambda guess: newton(closing_gaps, guess, loop, settings).x)(guesses)
     missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, loop))))(loops)
     # a free motion that touches the surface is no orbit of impacts
-    # of the drive's speed
+    # above capture by less, over the drive's speed, an impact is none
     leaves = jnp.min(loops[:, impacts:], axis=1) > capture + 1e-8
     return loops, usable & (missing < _CLOSED) & leaves
 
@@ -343,6 +343,7 @@ def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[n
         speeds = np.roll(speeds, -first)
         rolled = rolled_states(np.append(turned, speeds / speeds.max()))
         shorter = [shift for shift in range(1, count) if count % shift == 0]
+        # relative to the hardest impact, nearer loops are one
         if not any((np.abs(others - rolled[0]).max(axis=(1, 2)) < 1e-7).any() for others in (rolled[shorter], known)):
             known = np.concatenate([known, rolled])
             result.append(np.append(turned, speeds))

@@ -256,6 +256,7 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     """Return tips after the next 40 contacts, simulated together, and these contacts."""
     period = np.asarray(scenes.platform.period_us)
     slower = np.maximum(period, 2.0 * np.pi / np.asarray(scenes.cantilever.angular_frequency))
+    # so many of the longer periods for each contact
     motion = jax.tree.map(np.asarray, _followed(scenes, tips, 6.0 * _ROWS * slower, accuracy=accuracy))
     contacts = motion.contacts
     going = tips.outcome == Outcome.IMPACT

@@ -116,7 +116,7 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
 
     def first_impact_of(scene: Scene, start: State) -> NextImpact:
         gap = start.position_nm - scene.platform.position(start.time_us)
-        # on the surface but for rounding
+        # on the surface but for the rounding of the heights it is the difference of
         gap = jnp.where(jnp.abs(gap) < 1e-13 * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
         departure = Departure(start.time_us, gap, start.velocity_nm_per_us)
         return or_rest(scene, departure, impact_after(scene, departure, Search(MAX_STEPS, from_above=True)))
@@ -177,7 +177,7 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
         start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
         rise = clearance / orbit.speeds.rebound
         height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
-        # the path bends by less than this, where it rises at all
+        # a tip that comes so far in a straight path's time comes there: the path bends by less, where it rises at all
         risen = height - platform.position(start + rise) >= 0.9 * clearance
         return steady & risen & law.leaves, (start + rise) % platform.period_us, speed
 
