@@ -318,7 +318,7 @@ def single_contact_orbits(
         for row in np.flatnonzero(roots.converged):
             place, loop = (number, lane[row]), roots.details[row]
             columns["admissible"][place], columns["unresolved"][place] = True, False
-            largest, _ = np.abs(multipliers_of(*trace_and_determinant(loop.maps)))
+            largest, _ = np.abs(multipliers_of(*map(np.asarray, trace_and_determinant(loop.maps))))
             multiplier, peak = largest, float(loop.heights()[0])
             if multiplier < 1.0 and not peak < columns["peak_amplitude_nm"][place]:
                 columns["stable"][place] = True
