@@ -59,7 +59,7 @@ def test_at_resonance_an_orbit_needs_a_drive_that_reaches_the_rest_position(orde
     """Omega = omega/2N: the tangent of eq. 9 is infinite, so the impact height is 0, beta cos(omega t) = -sigma."""
     amplitude = np.array([0.9, 0.999, 1.001, 1.1])
     scenes = batch_of_scenes(presets.figure2_scene, np.full(4, float(order)), amplitude)
-    verdicts = orbit_verdicts(scenes, first_order=order, last_order=order)
+    verdicts = orbit_verdicts(scenes, [order])
     assert verdicts.stable[0].tolist() == [False, False, True, True]
     # Half a free period above the rest position, leaving at V' = v_p (1 + r)/(1 - r) (eq. 1 with V = -V').
     platform_speed = 2e-3 * np.pi * 180.0 * order * np.sqrt(amplitude[2:] ** 2 - 1.0)
@@ -73,7 +73,7 @@ def test_no_orbit_where_adhesion_takes_more_than_the_platform_gives():
     frequency = np.linspace(0.6, 6.4, 200)
     for factor, some in ((0.999, False), (1.05, True)):
         scenes = batch_of_scenes(presets.figure3_scene, frequency, factor * adhesion_limit_nm(frequency))
-        assert orbit_verdicts(scenes, last_order=8).admissible.any() == some
+        assert orbit_verdicts(scenes, range(1, 9)).admissible.any() == some
 
 
 @pytest.mark.parametrize(("n", "side"), [(0.97, -1.0), (1.03, 1.0)])
@@ -83,12 +83,12 @@ def test_elastic_limit_of_the_amplitude(n: float, side: float):
     scenes = batch_of_scenes(presets.figure9_scene, np.full(3, n), offset, np.full(3, 0.9999))
     height = (offset + side * 0.75) / np.cos(np.pi / (2.0 * n))
     # 1 - r = 1e-4, with the square root of the loss's effect on the phase: some parts in a thousand
-    np.testing.assert_allclose(orbit_verdicts(scenes, last_order=1).peak_amplitude_nm[0], height, rtol=5e-3)
+    np.testing.assert_allclose(orbit_verdicts(scenes, [1]).peak_amplitude_nm[0], height, rtol=5e-3)
 
 
 @pytest.mark.slow
 def test_orders_above_14_add_nothing():
     figure2 = chart_of(presets.figure2_scene)
     frequency, amplitude = (column.reshape(60, 124)[::2, ::2].ravel() for column in figure2.points())
-    higher = orbit_verdicts(batch_of_scenes(presets.figure2_scene, frequency, amplitude), first_order=15, last_order=20)
+    higher = orbit_verdicts(batch_of_scenes(presets.figure2_scene, frequency, amplitude), range(15, 21))
     assert (higher.any_stable() & ~figure2.any_stable[::2, ::2].ravel()).mean() < 1e-3

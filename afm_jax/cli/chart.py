@@ -9,7 +9,6 @@ from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import NamedScene, ranges_of
 from afm_jax.cli.session import Session
 from afm_jax.dynamics.charts import stability_chart, stable_probability
-from afm_jax.scenefile.parameter_paths import scene_family
 
 _MOST_POINTS = 4_000_000
 
@@ -42,12 +41,10 @@ def chart(
     across, up = ranges_of(scene, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
-    paths, values = (across.path, up.path), {"x_values": across.values, "y_values": up.values}
     with session.working("searching for orbits (the first run compiles for some seconds)", "points") as report:
-        found = stability_chart(scene_family(scene.scene, *paths), **values, last_order=orders, report=report)
-        result = replace(found, x=across, y=up)
+        result = stability_chart(scene.scene, x_values=across, y_values=up, last_order=orders, report=report)
         if scene.unknowns is not None:
-            probability = stable_probability(scene.scene, result, scene.unknowns, paths, draws=draws)
+            probability = stable_probability(scene.scene, result, scene.unknowns, (across.path, up.path), draws=draws)
             result = replace(result, probability=probability)
     files = {"chart.png": picture_of("dynamics:chart_figure", result)}
     return Output.of(result, files=files)

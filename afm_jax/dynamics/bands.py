@@ -20,17 +20,14 @@ from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.bifurcations import BifurcationDiagram, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.impact_loop import highest_point
 from afm_jax.dynamics.impact_orbits import BLOCK, LawLoops
-from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
+from afm_jax.dynamics.special_points import OrbitBranch
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
 
 _BETWEEN = (0.025, 0.975)
 """Quantiles between which 95 % of the draws lie."""
-_STARTS = 100
-"""Starts along each axis of the basins of a draw, at most."""
-_NEVER_NEGATIVE = ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor")
 
 
 class UncertainParameters(NamedTuple):
@@ -57,8 +54,10 @@ class UncertainParameters(NamedTuple):
             drawn = np.random.default_rng(0).multivariate_normal(self.values, self.covariance, size=50 * number)
         good = np.ones(len(drawn), bool)
         for path, column in zip(self.paths, drawn.T, strict=True):
-            good &= (column > 0.0) & (column <= 1.0) if path == "interaction.r" else True
-            good &= column >= 0.0 if path in _NEVER_NEGATIVE else True
+            if path == "interaction.r":
+                good &= (column > 0.0) & (column <= 1.0)
+            if path in ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor"):
+                good &= column >= 0.0
         if good.sum() < number:
             raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
         return drawn[good][:number]
@@ -78,8 +77,13 @@ def special_errors(continuation: Continuation, uncertain: UncertainParameters) -
         uncertain: parameters; if the one that was followed is among them, its own error does not count.
     """
     uncertain = uncertain.without(continuation.range.path)
-    slopes = [_slopes_of_special_point(continuation, point, uncertain) for point in continuation.special]
-    return np.array([np.sqrt(slope @ uncertain.covariance @ slope) for slope in slopes])
+    width, errors = continuation.range.high - continuation.range.low, []
+    for point in continuation.special:
+        at = jnp.asarray(np.append(point.point, uncertain.values))
+        by_uncertain, _ = _slopes_at(_with_uncertain(continuation, uncertain, point.test), at)
+        slope = width * np.asarray(by_uncertain)[-1]
+        errors.append(np.sqrt(slope @ uncertain.covariance @ slope))
+    return np.array(errors)
 
 
 def amplitude_errors(
@@ -91,8 +95,7 @@ def amplitude_errors(
     """
     uncertain = uncertain.without(continuation.range.path)
     family = _with_uncertain(continuation, uncertain, None)
-    followed = (branch.parameter - continuation.range.low) / (continuation.range.high - continuation.range.low)
-    points = np.column_stack([branch.unknowns, followed, np.tile(uncertain.values, (len(followed), 1))])
+    points = np.column_stack([branch.points, np.tile(uncertain.values, (len(branch.points), 1))])
     slope = in_blocks(lambda block: _amplitude_slopes(family, block), points, block=BLOCK, widths=())
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
@@ -105,41 +108,26 @@ def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, 
     return replace(family, low=low, width=width, paths=(continuation.range.path, *uncertain.paths), test=test)
 
 
-def _slopes_of_special_point(
-    continuation: Continuation, point: SpecialPoint, uncertain: UncertainParameters
-) -> Float[np.ndarray, " uncertain"]:
-    """Return dp/da: the derivatives of the parameter of a special point by the uncertain ones."""
-    family = _with_uncertain(continuation, uncertain, point.test)
-    width = continuation.range.high - continuation.range.low
-    followed = (point.parameter - continuation.range.low) / width
-    at = jnp.asarray(np.concatenate([point.unknowns, [followed], uncertain.values]))
-    return np.asarray(_slopes_by_uncertain(family, at))[-1] * width
+@jax.jit
+def _slopes_at(family: LawLoops, point: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return how what is solved for moves with the uncertain parameters behind it, and how the peak amplitude does.
+
+    All that stands before the uncertain parameters is solved for, but for a followed one that is held.
+    """
+    uncertain = len(family.paths) - 1
+
+    def equations_and_peak(point: Array) -> tuple[Array, Array]:
+        return family.equations(point), highest_point(*family.at(point), family.samples)
+
+    by_point, peak_by_point = jax.jacfwd(equations_and_peak)(point)
+    solved, behind = by_point.shape[0], point.shape[0] - uncertain
+    by_uncertain = -jnp.linalg.solve(by_point[:, :solved], by_point[:, behind:])
+    return by_uncertain, peak_by_point[behind:] + peak_by_point[:solved] @ by_uncertain
 
 
 @jax.jit
-def _slopes_by_uncertain(family: LawLoops, point: Array) -> Float[Array, "n uncertain"]:
-    slopes = jax.jacfwd(family.equations)(point)
-    solved = slopes.shape[0]
-    return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
-
-
-@jax.jit
-def _amplitude_slopes(family: LawLoops, points: Array) -> Float[Array, "points uncertain"]:
-    """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
-
-    def slopes_at(point):
-        count = point.shape[0] - len(family.paths)
-        followed, uncertain = point[count : count + 1], point[count + 1 :]
-
-        def gaps_and_peak(unknowns, values):
-            _, loop = family.at(jnp.concatenate([unknowns, followed, values]))
-            return closing_gaps(unknowns, loop), highest_point(unknowns, loop, family.samples)
-
-        slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)
-        (gaps_by_loop, gaps_by_uncertain), (peak_by_loop, peak_by_uncertain) = slopes
-        return peak_by_uncertain - peak_by_loop @ jnp.linalg.solve(gaps_by_loop, gaps_by_uncertain)
-
-    return jax.vmap(slopes_at)(points)
+def _amplitude_slopes(family: LawLoops, points: Float[Array, "points n"]) -> Float[Array, "points uncertain"]:
+    return jax.vmap(lambda point: _slopes_at(family, point)[1])(points)
 
 
 def drawn_exponents(
@@ -213,7 +201,8 @@ def drawn_shares(
     """
     speed = basins.rebound_speed_nm_per_us
     half = 0.5 * (speed[1] - speed[0])
-    rows, columns = (min(count, _STARTS) for count in basins.attractor.shape)
+    # so many starts along each axis are enough for a draw
+    rows, columns = (min(count, 100) for count in basins.attractor.shape)
     ends = max(float(speed[0] - half), 0.0), float(speed[-1] + half)
     shares = np.zeros((draws, len(basins.attractors)))
     for number, drawn in enumerate(uncertain.scenes(scene, draws)):

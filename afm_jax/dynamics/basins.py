@@ -25,18 +25,8 @@ from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
 
-_SAMPLE = 512
 _LONG = 1000
 """Impacts after which the motions of a sample are distinguished."""
-_SAME = 1e-3
-"""Distance, of the velocity if that is larger, below which points are those of one orbit."""
-_ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
-"""Numbers of impacts after which starts that have arrived drop out."""
-_PART = 8 * LANES
-_LEFT = 20_000
-"""Largest number of starts that are distinguished one by one in the end."""
-
-_NOTHING = np.zeros(0)
 
 
 class Attractor(NamedTuple):
@@ -55,7 +45,7 @@ class Attractor(NamedTuple):
     phase_rad: Float[np.ndarray, " impacts"]
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
     approach_speed_nm_per_us: Float[np.ndarray, " seen"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " impacts"] = _NOTHING
+    rebound_speed_nm_per_us: Float[np.ndarray, " impacts"] = np.zeros(0)
 
 
 @public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
@@ -90,11 +80,8 @@ class Basins(ResultTuple):
         """Why the shares are not valid: some starts could not be followed; None where all were."""
         lost = np.array([attractor.kind == MotionKind.UNRESOLVED for attractor in self.attractors])
         unresolved = 100.0 * self.share[lost].sum()
-        return (
-            f"{unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
-            if unresolved
-            else None
-        )
+        why = f"{unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
+        return why if unresolved else None
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
@@ -149,17 +136,12 @@ class Basins(ResultTuple):
             "attractor": names[self.attractor.ravel()],
         }
         points = [
-            {
-                "attractor": attractor.name,
-                "share": share,
-                "share_error": error,
-                "phase_rad": phase,
-                "velocity_after_nm_per_us": velocity,
-            }
-            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
+            {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
+            | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
+            for row in self.to_dict()["attractors"]
             # an attractor without an impact has a row, too
             for phase, velocity in zip(
-                attractor.phase_rad.tolist() or [None], attractor.velocity_nm_per_us.tolist() or [None], strict=True
+                row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
             )
         ]
         return {"basins.csv": starts, "attractors.csv": columns_of(points)}
@@ -206,7 +188,8 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        across, up = evenly_spread(_SAMPLE).T
+        # a sample, whose motions are told apart
+        across, up = evenly_spread(512).T
         finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
@@ -264,59 +247,56 @@ class _Finder:
         """Say which points are those of an orbit."""
         turn = (phase[:, None] - orbit.phase_rad + np.pi) % (2.0 * np.pi) - np.pi
         apart = np.hypot(turn, (velocity[:, None] - orbit.velocity_nm_per_us) / self.top).min(axis=1, initial=np.inf)
-        return apart < _SAME * np.maximum(1.0, np.abs(velocity) / self.top)
+        # distance, of the velocity if that is larger, below which points are those of one orbit
+        return apart < 1e-3 * np.maximum(1.0, np.abs(velocity) / self.top)
 
     def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
         """Return the attractors of motions after a long time; new ones are added to those known."""
         count = len(tips.time_us)
         _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, accuracy=1e-6, report=report)
-        label = np.empty(count, int)
-        for lane in range(count):
-            m = int(verdicts.impacts[lane])
-            phase = within_turn(self.omega * record.departure_us[lane, -m:], 2.0 * np.pi) if m else np.zeros(0)
-            velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
+        names, label = verdicts.names(), np.empty(count, int)
+        for lane, m in enumerate(verdicts.impacts.tolist()):
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
-            approach = record.approach_nm_per_us[lane, -m:]
-            label[lane] = self._number_of(kind, phase, velocity, approach[np.isfinite(approach)])
+            # of an orbit its points, each once
+            last = slice(-m, None) if m else slice(0)
+            phase = within_turn(self.omega * record.departure_us[lane, last], 2.0 * np.pi)
+            velocity, approach = record.velocity_after_nm_per_us[lane, last], record.approach_nm_per_us[lane, -m:]
+            motion = Attractor(names[lane], *kind, phase, velocity, approach[np.isfinite(approach)])
+            label[lane] = self.number_of(motion)
         return label
 
-    def _number_of(
-        self,
-        kind: tuple[int, int, int],
-        phase: np.ndarray = _NOTHING,
-        velocity: np.ndarray = _NOTHING,
-        approach: np.ndarray = _NOTHING,
-    ) -> int:
-        """Return the number of the attractor of a kind (`MotionKind`, m, N) through a motion's last points.
-
-        One that is not among those known so far is added.
-        """
+    def number_of(self, motion: Attractor) -> int:
+        """Return the number of the attractor that a motion has come to; one that is not known so far is added."""
         for number, attractor in enumerate(self.attractors):
-            if (attractor.kind, attractor.impacts, attractor.periods) != kind:
-                continue
-            if not kind[1]:
+            # the name says kind, m and N
+            if attractor.name == motion.name and (
+                not motion.impacts or self._is_at(attractor, motion.phase_rad[-1:], motion.velocity_nm_per_us[-1:])[0]
+            ):
                 return number
-            if self._is_at(attractor, phase[-1:], velocity[-1:])[0]:
-                return number
-        name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
-        self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
+        self.attractors.append(motion)
         return len(self.attractors) - 1
+
+    def pointless(self, kind: int) -> int:
+        """Return the number of the attractor of a kind that has no points."""
+        return self.number_of(Attractor(MotionKind(kind).name.lower(), kind, 0, 0, *[np.zeros(0)] * 3))
 
     def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
         """Return the attractor of every start, as soon as it has arrived."""
         count = len(tips.time_us)
         label, remaining = np.full(count, -1), np.arange(count)
-        for impacts in _ROUNDS:
+        # after so many impacts starts that have arrived drop out
+        for impacts in (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512):
 
             def work(some: Tips, impacts: int = impacts) -> Tips:
                 return _later(self.scene, some, impacts=impacts)
 
-            tips = in_blocks(work, tips, block=_PART)
+            # pieces of usual width, some in a call
+            tips = in_blocks(work, tips, block=8 * LANES)
             arrival, kinds = np.full(remaining.size, -1), kinds_of(tips.outcome)
             for number, orbit in enumerate(self.attractors):
                 arrival[self._is_at(orbit, self.omega * tips.time_us, tips.velocity_nm_per_us)] = number
             for kind in np.unique(kinds[kinds != MotionKind.IRREGULAR]).tolist():
-                arrival[kinds == kind] = self._number_of((kind, 0, 0))
+                arrival[kinds == kind] = self.pointless(kind)
             label[remaining] = arrival
             going = arrival < 0
             remaining, tips = remaining[going], jax.tree.map(lambda part, going=going: part[going], tips)
@@ -324,10 +304,11 @@ class _Finder:
                 report(count - remaining.size, count)
             if not remaining.size:
                 return label
-        if remaining.size <= _LEFT:
+        # more starts are not distinguished one by one in the end
+        if remaining.size <= 20_000:
             label[remaining] = self.told_apart(tips)
         else:
-            label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
+            label[remaining] = self.pointless(int(MotionKind.IRREGULAR))
         return label
 
 

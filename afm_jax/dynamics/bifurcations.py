@@ -28,20 +28,6 @@ from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
 from afm_jax.solve.lanes import LANES, Report
 from afm_jax.units import within_turn
 
-_STRETCHES = LANES
-"""Stretches at most that are ramped side by side: one block of tips."""
-_LONGEST_AGAIN = 320
-"""Values at most over which a lane goes on beyond its stretch."""
-_FEW = 16
-"""Lanes of a block of laws."""
-_SAME = 1e-4
-"""Of the largest speed: points of orbits closer than this are the same."""
-_LISTED = 6
-"""Kinds of motion that a line names."""
-_NONE_WENT_ON = (
-    "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
-)
-
 
 @public_result(picture="afm_jax.plots.dynamics:bifurcation_figure")
 class BifurcationDiagram(ResultTuple):
@@ -103,8 +89,8 @@ class BifurcationDiagram(ResultTuple):
     def printed(self) -> list[str]:
         """Return a line with the commonest kinds of motion, and at how many values each is."""
         counts = Counter(self.verdicts.names()).most_common()
-        words = [f"{name} at {count}" for name, count in counts[:_LISTED]]
-        others = sum(count for _, count in counts[_LISTED:])
+        words = [f"{name} at {count}" for name, count in counts[:6]]
+        others = sum(count for _, count in counts[6:])
         return [f"ramped {self.direction}: " + ", ".join([*words, *([f"others at {others}"] if others else [])])]
 
     def tables(self, parameter: str = "value") -> dict[str, dict[str, np.ndarray]]:
@@ -145,8 +131,11 @@ class Ramps(NamedTuple):
     @property
     def reason(self) -> str | None:
         """Why the diagram is empty; None where a motion goes on somewhere."""
-        went_on = any(np.isfinite(sweep.phase_rad).any() for sweep in self.sweeps)
-        return None if went_on else _NONE_WENT_ON
+        if any(np.isfinite(sweep.phase_rad).any() for sweep in self.sweeps):
+            return None
+        return (
+            "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
+        )
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
@@ -231,15 +220,9 @@ def bifurcation_diagram(  # noqa: PLR0913
         return np.where(shown, part, np.nan)
 
     # in the lab the platform is another one than the frame's
-    amplitude, offset, ahead, omega = (
-        np.asarray(part)[:, None]
-        for part in (
-            platform.amplitude_nm,
-            platform.offset_nm,
-            seen.frame.phase_rad,
-            seen.scenes.platform.angular_frequency,
-        )
-    )
+    amplitude, offset = np.asarray(platform.amplitude_nm)[:, None], np.asarray(platform.offset_nm)[:, None]
+    ahead = np.asarray(seen.frame.phase_rad)[:, None]
+    omega = np.asarray(seen.scenes.platform.angular_frequency)[:, None]
     return BifurcationDiagram(
         values=ordered,
         upward=upward,
@@ -270,14 +253,17 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
         report: called with how many of how many values are done.
     """
     count = len(fresh.time_us)
-    length = -(-count // _STRETCHES)
+    # stretches at most that are ramped side by side: one block of tips
+    length = -(-count // LANES)
     numbers = starts = np.arange(0, count, length)
-    few = {} if isinstance(scenes.interaction, Contact) else {"block": _FEW, "widths": (_FEW,)}
+    # few tips with laws, so that a lane that goes on alone does not wait for many
+    how = {"accuracy": accuracy, "block": LANES if isinstance(scenes.interaction, Contact) else 16}
     at, begin = _rows_of((scenes, fresh), starts)
-    rows = motions_of(at, begin, impacts, accuracy=accuracy, **few)
+    rows = motions_of(at, begin, impacts, **how)
     # no motion is of the kind -1
     ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
-    for step in range(1, length + _LONGEST_AGAIN):
+    # a lane goes on over so many values at most beyond its stretch
+    for step in range(1, length + 320):
         new = ~_same(rows, _rows_of(ramped, numbers))
         for part, values in zip(jax.tree.leaves(ramped), jax.tree.leaves(rows), strict=True):
             part[numbers[new]] = values[new]
@@ -288,7 +274,7 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
             report(min(step * len(starts), count), count)
         before, end = _rows_of((scenes, ramped.end), numbers - 1)
         at, begin = _rows_of((scenes, fresh), numbers)
-        rows = motions_of(at, carried(before, at, begin, end), impacts, accuracy=accuracy, **few)
+        rows = motions_of(at, carried(before, at, begin, end), impacts, **how)
     return ramped, False
 
 
@@ -325,22 +311,20 @@ def _same(one: Motions, other: Motions) -> Bool[np.ndarray, " lanes"]:
     speeds, others = (
         np.sort(np.where(_shown(each.verdicts), each.record.approach_nm_per_us, 0.0), axis=1) for each in (one, other)
     )
-    near = np.abs(speeds - others).max(axis=1) <= _SAME * np.maximum(others[:, -1], 1e-12)
+    # of the largest speed
+    near = np.abs(speeds - others).max(axis=1) <= 1e-4 * np.maximum(others[:, -1], 1e-12)
     return same & (near | (a.kind != MotionKind.ORBIT))
-
-
-_STROBE_IMPACTS, _STROBES = 48, 8
-"""Last impacts in whose flights the tip's height is taken, and heights at most in a flight."""
 
 
 def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray) -> Float[np.ndarray, "values heights"]:
     """Return the tip's heights whenever the drive's phase is 0: with a moving platform, whenever it is highest."""
-    period, some = np.asarray(seen.scenes.platform.period_us), slice(-_STROBE_IMPACTS - 1, None)
+    # of the last 48 flights, and 8 heights at most in a flight
+    period, some = np.asarray(seen.scenes.platform.period_us), slice(-49, None)
     # in periods of the scene's own clock
     ahead = np.asarray(seen.frame.phase_rad)[:, None] / (2.0 * np.pi)
     begin = record.turns(period)[:, some][:, :-1] + ahead
     end = (record.arrival_periods + record.arrival_us / period[:, None])[:, some][:, 1:] + ahead
-    strobe = np.ceil(begin)[..., None] + np.arange(_STROBES)
+    strobe = np.ceil(begin)[..., None] + np.arange(8)
     flown = np.nan_to_num((strobe - begin[..., None]) * period[:, None, None])
     departure, velocity = (
         part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)

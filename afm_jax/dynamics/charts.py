@@ -4,7 +4,7 @@ For every scene and every order N the roots of the closing condition are found; 
 judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,9 +31,6 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
 
-_LANES = 1024
-"""Scenes gone through together: few enough for the cache, many enough to fill the vector units."""
-
 
 class OrbitVerdicts(NamedTuple):
     """What there is at each scene, one row an order, one column a scene (NumPy arrays).
@@ -57,34 +54,31 @@ class OrbitVerdicts(NamedTuple):
         return np.asarray(self.stable.any(axis=0))
 
 
-def orbit_verdicts(
-    scenes: Scene, *, first_order: int = 1, last_order: int, report: Report | None = None
-) -> OrbitVerdicts:
+def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | None = None) -> OrbitVerdicts:
     """Find the single-impact orbits of many scenes for a range of orders.
 
     Roots are searched for at all scenes; only where there is one its orbit is looked at.
 
     Args:
         scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
-        first_order: lowest order N.
-        last_order: highest order N.
+        orders: N.
         report: called with how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     if isinstance(scenes.interaction, Contact):
-        return OrbitVerdicts(**single_contact_orbits(scenes, range(first_order, last_order + 1), report=report))
+        return OrbitVerdicts(**single_contact_orbits(scenes, orders, report=report))
     seen = sample_driven(scenes)
-    orders = jnp.arange(first_order, last_order + 1, dtype=float)
     names = ("peak_amplitude_nm", "largest_multiplier", "approach_speed_nm_per_us")
 
     def work(part: SampleDriven) -> OrbitVerdicts:
-        orbits = highest_orbits(part.scenes, part.frame, orders, names=names)
+        orbits = highest_orbits(part.scenes, part.frame, jnp.asarray(orders, float), names=names)
         stable, admissible = (orbits[name] > 0 for name in ("stable_orbits", "admissible_orbits"))
         return OrbitVerdicts(stable, admissible, **{name: orbits[name] for name in names})
 
-    return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
+    # few enough for the cache, many enough to fill the vector units
+    return jax.tree.map(np.transpose, in_blocks(work, seen, block=1024, report=report))
 
 
 ORBIT_NUMBERS = (
@@ -99,8 +93,6 @@ ORBIT_NUMBERS = (
 """Columns of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
 DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
 """Further columns of a scene that base or force drives."""
-_ORBITS_AT_ONCE = 2
-"""Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
 
 @partial(jax.jit, static_argnames=("names",))
@@ -144,7 +136,8 @@ def highest_orbits(
         rows = jnp.arange(count * slots) // slots
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & impact_law_of(scenes).leaves
-        few = max(count // _ORBITS_AT_ONCE, 1)
+        # few scenes have more than one orbit: blocks of roots are smaller than blocks of scenes
+        few = max(count // 2, 1)
         is_orbit = roots.found.ravel() & jnp.repeat(there, slots)
         columns = again_for(jax.vmap(orbit_of), is_orbit, (places, rows), nothing, block=few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in columns)
@@ -291,8 +284,8 @@ class StabilityChart(Result):
 def stability_chart(
     scene_of: Scene | Callable[..., Scene],
     *,
-    x_values: str | Float[np.ndarray, " columns"],
-    y_values: str | Float[np.ndarray, " rows"],
+    x_values: str | ParameterRange | Float[np.ndarray, " columns"],
+    y_values: str | ParameterRange | Float[np.ndarray, " rows"],
     last_order: int,
     report: Report | None = None,
 ) -> StabilityChart:
@@ -316,7 +309,10 @@ def stability_chart(
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
     if isinstance(scene_of, Scene):
-        across, up = (parse_range(str(text), counted=True) for text in (x_values, y_values))
+        across, up = (
+            parse_range(given if isinstance(given, ParameterRange) else str(given), counted=True)
+            for given in (x_values, y_values)
+        )
         check_ranges(scene_of, across, up)
         values = {"x_values": across.values, "y_values": up.values}
         family = scene_family(scene_of, across.path, up.path)
@@ -326,7 +322,7 @@ def stability_chart(
         if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):
             raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
-    verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
+    verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), range(1, last_order + 1), report=report)
     return StabilityChart(scene_of, x, y, verdicts)
 
 

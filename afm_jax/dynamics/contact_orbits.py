@@ -6,7 +6,6 @@ loop is closed to rounding and its multipliers are exact.
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,12 +19,21 @@ from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import approximate_law
-from afm_jax.dynamics.impact_loop import GRAZING, LoopFamily, LoopReading, driven_part, highest_of_flights, lowest_gap
+from afm_jax.dynamics.impact_loop import (
+    GRAZING,
+    LoopFamily,
+    LoopReading,
+    driven_part,
+    highest_of_flights,
+    impacts_at,
+    lowest_gap,
+    trace_and_determinant,
+)
 from afm_jax.dynamics.impact_orbits import (
+    LawLoops,
     ManyImpactOrbits,
     check_loop,
     loops_told_apart,
-    many_impact_orbits,
     multipliers_of,
     orbits_of,
 )
@@ -44,21 +52,11 @@ _STARTS = 8
 """Tips that are simulated for guesses, besides the one that starts where `simulate` does."""
 _SETTLING = 60
 """Contacts before their guesses."""
-_WINDOW = 0.05
-"""Periods by which the contacts of a guess may miss N drive periods."""
-_LARGEST_CHANGE = 0.3
-"""Longest step of Newton's method: in a phase, rad, and of a speed."""
-_FEW = 16
-"""Contacts of a few loops followed together, one program."""
 CHART_ACCURACY = 1e-6
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
 """Of unknowns without dimension, for derivatives of test functions."""
-_RISING = 8
-"""Rounds of Newton's method for where a flight comes to the end of contact."""
-_LONGEST_CONTACT = 0.5
-"""Time that a contact may take beyond where it was expected to end, in flights of the loop."""
 
 
 @checked
@@ -88,7 +86,8 @@ def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = 
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
     check_loop(order, impacts)
     family = ContactLoops.of(scene, order, accuracy=accuracy)
-    flown = [loop for loop in family.flown(family.found(np.zeros(0), impacts)[0]) if loop is not None]
+    found, _ = family.found(np.zeros(0), impacts)
+    flown = [loop for loop in family.flown(found, np.zeros((len(found), 0))) if loop is not None]
     loops = np.array([loop.loop for loop in flown]).reshape(-1, 2 * impacts)
     return orbits_of(loops, _readings_of(flown, impacts))
 
@@ -116,18 +115,19 @@ class FlownLoop(NamedTuple):
         by_parameters = self.maps[:, :, 2:].transpose(1, 0, 2).reshape(2 * count, -1)
         return np.hstack([whole.reshape(2 * count, 2 * count), by_parameters])
 
-    @property
-    def trace_and_determinant(self) -> tuple[float, float]:
-        """T and D of the linearised map."""
-        maps = self.maps[:, :, :2]
-        # the determinant of the product cancels
-        return float(np.trace(reduce(lambda product, each: each @ product, maps))), float(np.prod(np.linalg.det(maps)))
+    @jax.jit
+    def heights(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return the largest height of the tip in nm, and its lowest point above the gap at which the bridge forms.
 
-    def heights(self) -> tuple[float, float]:
-        """Return the largest height of the tip in nm, and its lowest above the gap at which the bridge forms."""
-        rebound = np.split(self.loop, 2)[1]
-        highest, lowest = _heights(self.scene, self.departure_us, rebound, self.contacts.arrival_time_us)
-        return float(highest), float(lowest)
+        That one is infinite where no flight has a lowest point.
+        """
+        scene, begin_us, rebound = self.scene, jnp.asarray(self.departure_us), jnp.split(self.loop, 2)[1]
+        surface, response = surface_of(scene)
+        level, rate = surface.position_and_velocity(begin_us)
+        lasts = self.contacts.arrival_time_us - begin_us
+        flights = begin_us, level + gap_of_departure(scene), rate + rebound, jnp.zeros_like(begin_us), lasts
+        lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES) - scene.interaction.bridge_forms_nm
+        return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest
 
 
 def _flown(
@@ -161,12 +161,14 @@ def _flown(
     unknowns = np.concatenate(
         [np.stack([phase, rebound], axis=2), np.repeat(parameters[:, None], count, axis=1)], axis=2
     )
-    until = (following + _LONGEST_CONTACT * shortest)[flies]
+    # a contact may take longer than expected by this, in flights of the loop
+    until = (following + 0.5 * shortest)[flies]
     lanes = (
         jax.tree.map(lambda leaf: np.repeat(leaf[flies], count, axis=0), scenes),
         *(part.reshape(flies.size * count, *part.shape[2:]) for part in (unknowns[flies], until)),
     )
-    block, widths = (_FEW, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
+    # of a few loops: one program for all numbers of contacts
+    block, widths = (16, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
     results = in_blocks(lambda part: next_departures(*part, **settings), lanes, block=block, widths=widths)
     later, maps, contacts, there = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), results)
     ends = (contacts.kind == ContactKind.IMPACT).all(axis=1) & np.isfinite(maps).all(axis=(1, 2, 3))
@@ -201,7 +203,8 @@ def _closed(
 
     def damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
         longest = np.concatenate([np.ones((len(loops), count)), loops[:, count:]], axis=1)
-        return shortened(step, _LARGEST_CHANGE * longest)
+        # of a phase in rad, and of a speed
+        return shortened(step, 0.3 * longest)
 
     def linearised(loops: Float[np.ndarray, "loops n"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
         residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
@@ -219,40 +222,13 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, 
     law = approximate_law(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
         return np.zeros((0, 2 * impacts))
-    law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)
-    if impacts == 1:
-        # all of them, close to capture too, where no start of a search stays
-        orbits = single_impact_orbits(law_scene, order)
-        admissible = np.asarray(orbits.exists & orbits.admissible)
-        phases = np.asarray(orbits.phase_rad)[admissible, None]
-        rebounds = np.asarray(orbits.rebound_speed_nm_per_us)[admissible, None]
-    else:
-        reading = many_impact_orbits(law_scene, order, impacts).reading
-        phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
-    # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
-    turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
-    starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
-    guesses = _where_contact_ends(scene, starts, rebounds)
-    return guesses[np.isfinite(guesses).all(axis=1) & (guesses[:, impacts:] > 0.0).all(axis=1)]
-
-
-def _where_contact_ends(
-    scene: Scene, phases: Float[np.ndarray, "orbits m"], rebounds: Float[np.ndarray, "orbits m"]
-) -> Float[np.ndarray, "orbits n"]:
-    """Return phases and speeds against the surface at which flights from the surface come to where contact ends.
-
-    By Newton's method, from straight paths: slow tips take a good part of a drive period.
-    """
-    surface, _ = surface_of(scene)
-    omega, gap = float(drive_of(scene).angular_frequency), float(gap_of_departure(scene))
-    begin, rise, speed = phases / omega, gap / rebounds, rebounds
-    height, rate = surface.position_and_velocity(begin)
-    for _ in range(_RISING):
-        position, velocity = scene.cantilever.propagator(rise)(height, rate + rebounds)
-        level, level_rate = surface.position_and_velocity(begin + rise)
-        speed = velocity - level_rate
-        rise = rise - (position - level - gap) / speed
-    return np.concatenate([phases + omega * rise, speed], axis=1)
+    family = LawLoops.of(eqx.tree_at(lambda scene: scene.interaction, scene, law), order)
+    loops, _ = family.found(np.zeros(0), impacts)
+    of_law = jax.vmap(lambda loop: impacts_at(*family.at(loop)))(jnp.asarray(loops))
+    omega, rebound = float(drive_of(scene).angular_frequency), np.asarray(of_law.speeds.rebound)
+    # a straight path to the gap at which contact ends
+    phases = omega * (np.asarray(of_law.leaving_us) + float(gap_of_departure(scene)) / rebound)
+    return np.concatenate([phases, rebound], axis=1)[(rebound > 0.0).all(axis=1)]
 
 
 def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
@@ -280,7 +256,8 @@ def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> lis
     for lane in range(_STARTS + 1):
         for begin in range(impacts + 1):
             window = turns[lane, begin : begin + impacts + 1]
-            if abs(window[-1] - window[0] - order) < _WINDOW:
+            # the contacts of a guess may miss N drive periods by this
+            if abs(window[-1] - window[0] - order) < 0.05:
                 phases = 2.0 * np.pi * (window[:-1] - np.floor(window[0]))
                 guesses.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
     return guesses
@@ -316,22 +293,19 @@ def single_contact_orbits(
     if laws is None:
         return columns
     plain, driven = jax.tree.map(np.asarray, scenes), driven_part(jax.tree.map(lambda leaf: leaf[0], scenes))
-    with_law = np.flatnonzero(laws[1])
-    law_scenes = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[with_law], eqx.tree_at(lambda each: each.interaction, scenes, laws[0])
-    )
+    law_scenes = jax.tree.map(np.asarray, eqx.tree_at(lambda each: each.interaction, scenes, laws[0]))
     for number, order in enumerate(orders):
 
         def of_law(block: Scene, order: int = order) -> SingleImpactOrbits:
             return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
 
         orbits = in_blocks(of_law, law_scenes, block=CONTACTS_AT_ONCE)
-        row, slot = np.nonzero(orbits.exists & orbits.admissible)
-        lane, rebound = with_law[row], orbits.rebound_speed_nm_per_us[row, slot]
+        lane, slot = np.nonzero(orbits.exists & orbits.admissible & laws[1][:, None])
+        rebound = orbits.rebound_speed_nm_per_us[lane, slot]
         # a straight path to the gap at which contact ends
         omega = RAD_PER_US_PER_KHZ * getattr(plain, driven).frequency_khz
         rise = np.asarray(omega * gap_of_departure(scenes))
-        guesses = np.stack([orbits.phase_rad[row, slot] + rise[lane] / rebound, rebound], axis=1)
+        guesses = np.stack([orbits.phase_rad[lane, slot] + rise[lane] / rebound, rebound], axis=1)
 
         def flown(
             loops: np.ndarray, rows: np.ndarray, lane: np.ndarray = lane, order: int = order
@@ -344,8 +318,8 @@ def single_contact_orbits(
         for row in np.flatnonzero(roots.converged):
             place, loop = (number, lane[row]), roots.details[row]
             columns["admissible"][place], columns["unresolved"][place] = True, False
-            largest, _ = np.abs(multipliers_of(*map(np.asarray, loop.trace_and_determinant)))
-            multiplier, peak = largest, loop.heights()[0]
+            largest, _ = np.abs(multipliers_of(*map(np.asarray, trace_and_determinant(loop.maps))))
+            multiplier, peak = largest, float(loop.heights()[0])
             if multiplier < 1.0 and not peak < columns["peak_amplitude_nm"][place]:
                 columns["stable"][place] = True
                 columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak, multiplier
@@ -364,9 +338,10 @@ class ContactLoops(LoopFamily):
     accuracy: float = eqx.field(static=True, default=DEFAULT_ACCURACY)
     """Of `simulate`."""
 
-    def flown(self, points: Float[np.ndarray, "points n"]) -> list[FlownLoop | None]:
-        """Return the loops at points of a curve as they are simulated."""
-        loops, values = self.loops_and_values(points)
+    def flown(
+        self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
+    ) -> list[FlownLoop | None]:
+        """Return loops in rad and nm/us at values of the parameters as they are simulated."""
         scenes = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(loops), *np.shape(leaf))), self.scene)
         settings = {"paths": self.paths, "driven": self.driven, "accuracy": self.accuracy}
         return _flown(scenes, loops, int(self.order), values, few=True, **settings)
@@ -375,10 +350,9 @@ class ContactLoops(LoopFamily):
         """Return loops of m contacts in rad and nm/us, each once; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
         guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, self.accuracy)]
-        fractions = (values - np.asarray(self.low)) / np.asarray(self.width)
 
         def flown(loops: np.ndarray, _: Any) -> list[FlownLoop | None]:
-            return self.flown(np.hstack([loops / self.units(impacts), np.tile(fractions, (len(loops), 1))]))
+            return self.flown(loops, np.tile(values, (len(loops), 1)))
 
         roots = _closed(flown, np.array(guesses).reshape(-1, 2 * impacts), _CLOSING)
         return loops_told_apart(roots.x[roots.converged], order), 0
@@ -389,7 +363,7 @@ class ContactLoops(LoopFamily):
         size = len(point)
         around = [np.eye(size), -np.eye(size)] if self.test is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [loop for loop in self.flown(point + aside) if loop is not None]
+        flown = [loop for loop in self.flown(*self.loops_and_values(point + aside)) if loop is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
@@ -407,19 +381,15 @@ class ContactLoops(LoopFamily):
 
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
-        flown = [loop for loop in self.flown(points) if loop is not None]
+        flown = [loop for loop in self.flown(*self.loops_and_values(points)) if loop is not None]
         if len(flown) < len(points):
             raise ValueError("a loop that was closed does not fly")
         return _readings_of(flown, (points.shape[1] - len(self.paths)) // 2)
 
-    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:  # noqa: ARG002
-        """Say no: a contact may capture."""
-        return False
-
     def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `LoopFamily.tests`; that of grazing NaN where it is not asked for."""
-        trace, determinant = flown.trace_and_determinant
-        near = flown.heights()[1] * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
+        trace, determinant = trace_and_determinant(flown.maps)
+        near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
         speeds = np.array([near, np.split(flown.loop, 2)[1].min()]) / float(self.speed_unit)
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
 
@@ -434,7 +404,7 @@ def _readings_of(flown: Sequence[FlownLoop], impacts: int) -> LoopReading:
 
 def _reading_of(flown: FlownLoop) -> LoopReading:
     scene, contacts, (phase, rebound) = flown.scene, flown.contacts, np.split(flown.loop, 2)
-    trace, determinant = flown.trace_and_determinant
+    trace, determinant = trace_and_determinant(flown.maps)
     # of the contact before each departure
     approach = np.roll(contacts.approach_speed_nm_per_us, 1)
     lasts = np.roll(contacts.departure_time_us - contacts.arrival_time_us, 1)
@@ -453,17 +423,3 @@ def _reading_of(flown: FlownLoop) -> LoopReading:
         "missing": np.abs(flown.gaps * np.repeat([1.0, 1.0 / rebound.max()], len(phase))).max(),
     }
     return LoopReading(**{name: jnp.asarray(value) for name, value in values.items()})
-
-
-@jax.jit
-def _heights(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -> tuple[Array, Array]:
-    """Return the largest height in nm of flights between contacts, and their lowest point above where the bridge forms.
-
-    Infinite where no flight has a lowest point.
-    """
-    surface, response = surface_of(scene)
-    level, rate = surface.position_and_velocity(begin_us)
-    height, velocity, lasts = level + gap_of_departure(scene), rate + rebound, arrival_us - begin_us
-    flights = begin_us, height, velocity, jnp.zeros_like(begin_us), lasts
-    lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES) - scene.interaction.bridge_forms_nm
-    return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest

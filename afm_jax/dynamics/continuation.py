@@ -21,7 +21,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
 from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
 from afm_jax.dynamics.impact_loop import CAPTURE, LoopFamily, driven_part
-from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, MOST_IMPACTS, LawLoops, impact_rows, orbit_facts
+from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, impact_rows, orbit_facts
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
@@ -40,11 +40,6 @@ from afm_jax.scenefile.parameter_paths import (
 )
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import counted
-
-_VALUES_TRIED = 9
-_FEWER_TRIED = 3
-_BEFORE_CAPTURE = 1e-6
-"""Of the last step's way to capture: there the orbit still exists."""
 
 _POINT_COLUMNS = (
     *("branch", "parameter", "phase_rad", "velocity_after_nm_per_us", "peak_amplitude_nm", "peak_amplitude_error_nm"),
@@ -272,10 +267,7 @@ def continue_orbits(
 
 
 def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRange]) -> None:
-    if int(order) != order or order < 1:
-        raise ValueError(f"`order` must be a positive integer, but is {order}")
-    if int(impacts) != impacts or not 0 <= impacts <= MOST_IMPACTS:
-        raise ValueError(f"`impacts` must be an integer from 0 to {MOST_IMPACTS}, but is {impacts}")
+    check_loop(order, impacts or 1)
     if not isinstance(scene.interaction, Contact):
         impact_law_of(scene)
     elif impacts == 0:
@@ -303,7 +295,7 @@ def _orbits_in_range(
     """
     value = parameter_values(family.scene)[given.path]
     few = impacts > 1 or isinstance(family, ContactLoops)
-    tried = np.linspace(0.0, 1.0, (_FEWER_TRIED if few else _VALUES_TRIED) + 2)[1:-1]
+    tried = np.linspace(0.0, 1.0, (3 if few else 9) + 2)[1:-1]
     # the middle first
     fractions = tried[np.argsort(np.abs(tried - 0.5), kind="stable")].tolist()
     if given.low <= value <= given.high:
@@ -325,9 +317,10 @@ def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
         if ends[place] == "capture":
             leg = curve.legs[place]
             root = root_on(leg, tested_by(CAPTURE, family), family)
-            last = None if root is None else leg.at(root[0] + _BEFORE_CAPTURE * (1 + place - root[0]), family)
+            # of the last step's way to capture: there the orbit still exists
+            last = None if root is None else leg.at(root[0] + 1e-6 * (1 + place - root[0]), family)
             points[place] = (leg.end if place == 0 else leg.begin).point if last is None else last.point
             if family.captures_nothing(points[place]):
                 ends[place] = "no_speed"
     value = float(family.low[0]) + float(family.width[0]) * points[:, -1]
-    return OrbitBranch(value, points[:, :-1], family.readings(points), (ends[0], ends[1]))
+    return OrbitBranch(value, points, family.readings(points), (ends[0], ends[1]))

@@ -17,26 +17,12 @@ from afm_jax.dynamics.impact_loop import CAPTURE, FOLD, LoopFamily, rolled_state
 from afm_jax.solve.arclength import point_in_plane
 from afm_jax.solve.newton import Newton
 
-_CLOSING = Newton(rounds=12, step_tolerance=1e-11)
-"""Steps towards a point: phases in rad, speeds of the fastest impact, parameters of their ranges."""
-_FIRST_STEP, _LONGEST_STEP = 0.01, 0.05
+_LONGEST_STEP = 0.05
 """Steps along a curve: phases in rad, speeds of the fastest impact, parameters of their ranges."""
-_SHORTEST_STEP = 1e-7
-_MOST_POINTS = 3000
 _STRAIGHT = 0.98
 """Smallest cosine between the tangents of neighbouring points."""
-_LONGER = 0.998
-"""Cosine from which on the next step is longer."""
-_OFF = 0.3
-"""Farthest that a point may lie from its guess, as a fraction of the step; beyond, it may belong to another curve."""
-_NEAR = 0.1
-"""Farthest that the first point of a curve may lie from where an orbit was found."""
 AT_A_ROOT = 1e-7
 """Largest test function at a root; a jump or a pole is none."""
-_LONGEST_DELAY = 0.5
-"""Of a drive period: beyond, a law's delay has lost its meaning close to capture."""
-_UNLIKE = 1e-3
-"""Distance at which a loop counts as one that repeats a shorter one."""
 _SAME = 1e-5
 
 
@@ -54,7 +40,8 @@ class CurvePoint(NamedTuple):
 
 def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
-    point = point_in_plane(family.linearised, guess, normal, _CLOSING)
+    # steps in phases in rad, speeds of the fastest impact, parameters of their ranges
+    point = point_in_plane(family.linearised, guess, normal, Newton(rounds=12, step_tolerance=1e-11))
     return None if point is None else CurvePoint(point.x, point.tangent, *family.tests(point))
 
 
@@ -96,7 +83,8 @@ def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve |
     """Return the curve through a point, followed both ways; None where the point is none of a curve."""
     normals = np.eye(len(start))[-1], np.full(len(start), 1.0 / np.sqrt(len(start)))
     solved = (solved_point(start, normal, family) for normal in normals)
-    first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < _NEAR), None)
+    # farther away it is another orbit than the one that was found
+    first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < 0.1), None)
     if first is None:
         return None
     ahead, why_ahead = _follow(first, family)
@@ -110,16 +98,18 @@ def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve |
 
 def _follow(begin: CurvePoint, family: LoopFamily) -> tuple[list[CurveLeg], str]:
     """Return the legs of a curve from a point along its tangent, and why they end."""
-    here, legs, length = begin, [], _FIRST_STEP
+    here, legs, length = begin, [], 0.2 * _LONGEST_STEP
     unlike_shorter = _unlike_a_shorter_loop(begin, family)
-    while len(legs) < _MOST_POINTS:
+    while len(legs) < 3000:
         guess = here.point + length * here.tangent
         ahead = solved_point(guess, here.tangent, family)
         if ahead is None or not (
-            np.linalg.norm(ahead.point - guess) < _OFF * length and here.tangent @ ahead.tangent > _STRAIGHT
+            # beyond, a point may belong to another curve
+            np.linalg.norm(ahead.point - guess) < 0.3 * length and here.tangent @ ahead.tangent > _STRAIGHT
         ):
             length *= 0.5
-            if length < _SHORTEST_STEP:
+            # the shortest step
+            if length < 1e-7:
                 return legs, "lost"
             continue
         fractions = ahead.point[-len(family.paths) :]
@@ -132,7 +122,8 @@ def _follow(begin: CurvePoint, family: LoopFamily) -> tuple[list[CurveLeg], str]
             return (legs if over == "capture" else legs[:-1]), over
         if len(legs) > 10 and _closes(ahead, begin, length, family):
             return legs, "closed"
-        if here.tangent @ ahead.tangent > _LONGER:
+        # a straight curve has longer steps
+        if here.tangent @ ahead.tangent > 0.998:
             length = min(1.5 * length, _LONGEST_STEP)
         here = ahead
     return legs, "too long"
@@ -144,9 +135,11 @@ def _why_over(
     """Return why a curve ends before a point; None where it goes on."""
     if family.test != CAPTURE and point.tests[CAPTURE] < 0.0:
         return "capture"
-    if point.delay > _LONGEST_DELAY:
+    # of a drive period: beyond, a law's delay has lost its meaning close to capture
+    if point.delay > 0.5:
         return "delay"
-    return "shorter" if unlike_shorter is not None and unlike_shorter(point) < _UNLIKE else None
+    # so near to a loop that repeats a shorter one it counts as that
+    return "shorter" if unlike_shorter is not None and unlike_shorter(point) < 1e-3 else None
 
 
 def _unlike_a_shorter_loop(first: CurvePoint, family: LoopFamily) -> Callable[[CurvePoint], float] | None:

@@ -27,19 +27,11 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.solve.lanes import LANES, WIDTHS, Report, in_blocks
+from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.words import counted, with_error
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""
-_MOST_IMPACTS = 1_200_000
-"""Impacts recorded together: of long motions a block holds fewer."""
-_BEYOND = 1e-3
-"""Time after a departure, in free periods, at which this contact is over and the next one has not begun."""
-_GROWS = 1e-9
-"""Larger exponent per impact above which an orbit is unstable; below it is rounding."""
-_ARRIVED = 1e-8
-"""Estimated distance from an orbit below which its multipliers are taken for the exponents."""
 
 
 @public_result(picture="afm_jax.plots.dynamics:exponents_figure")
@@ -93,7 +85,12 @@ class Lyapunov(ResultTuple):
         """Return the JSON object of `afm-jax lyapunov`: numbers of one motion, lists of many."""
         many, verdicts = np.ndim(self.impacts) > 0, exponent_verdicts(self._motions())
         told = {
-            **{name: getattr(self, name) for name in _TOLD},
+            "exponents_per_us": self.exponents_per_us,
+            "exponents_per_impact": self.exponents_per_impact,
+            "exponents_per_us_error": self.exponents_per_us_error,
+            "exponents_per_impact_error": self.exponents_per_impact_error,
+            "impacts": self.impacts,
+            "rested": self.rested,
             "orbit": {"impacts": self.verdicts.impacts, "periods": self.verdicts.periods},
             "verdict": verdicts if many else verdicts[0],
         }
@@ -145,11 +142,6 @@ class Lyapunov(ResultTuple):
         return {"lyapunov.csv": columns}
 
 
-_TOLD = (
-    *("exponents_per_us", "exponents_per_impact", "exponents_per_us_error", "exponents_per_impact_error"),
-    *("impacts", "rested"),
-)
-"""Attributes of `Lyapunov` that are keys of its JSON object."""
 CHAOTIC_ERRORS = 3.0
 """Standard errors by which the larger exponent must be above 0 to be called positive."""
 
@@ -160,7 +152,8 @@ def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     for lane, name in enumerate(exponents.verdicts.names()):
         kind = exponents.verdicts.kind[lane]
         larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
-        if kind == MotionKind.ORBIT and larger > max(_GROWS, error):
+        # below it is rounding
+        if kind == MotionKind.ORBIT and larger > max(1e-9, error):
             # rounding holds the motion there: no neighbour comes to it
             words.append(f"undecided: the motion stays on a {name} orbit that is unstable; try another [start]")
         elif kind == MotionKind.ORBIT:
@@ -226,9 +219,9 @@ def lyapunov_spectrum(
     if isinstance(scenes.interaction, Contact):
         exponents = work((scenes, tips))
     else:
-        block = max(1, min(LANES, _MOST_IMPACTS // impacts))
-        widths = [width for width in WIDTHS if width <= block]
-        exponents = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+        # impacts recorded together: of long motions a block holds fewer
+        block = max(1, min(LANES, 1_200_000 // impacts))
+        exponents = in_blocks(work, (scenes, tips), block=block, report=report)
     return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
@@ -244,7 +237,8 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
     tips, record = follow(scenes, tips, skip=max(transient - 1, 0), record=recorded, accuracy=accuracy)
     period = np.asarray(scenes.platform.period_us)
     last = Record(*(part[:, -RECORDED:] for part in record))
-    verdicts = verdicts_of(last, np.asarray(tips.outcome), period, tolerance=_ARRIVED)
+    # so near to an orbit its multipliers are taken for the exponents
+    verdicts = verdicts_of(last, np.asarray(tips.outcome), period, tolerance=1e-8)
     jacobians, determinants, passed = _linearised(scenes, record, period, accuracy)
 
     def parts(of_impacts: np.ndarray) -> Shaped[np.ndarray, "parts lanes"]:
@@ -349,10 +343,9 @@ def _contact_jacobians(
 ) -> Float[np.ndarray, "lanes steps 2 2"]:
     """Return the derivatives of next departures, d(phase, rebound speed) over d(phase, rebound speed) of these."""
     column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], scenes)
-    omega, until = (
-        column.platform.angular_frequency,
-        next_departure_us + _BEYOND * 1e3 / column.cantilever.frequency_khz,
-    )
+    omega = column.platform.angular_frequency
+    # a thousandth of a free period after a departure no contact goes on, and the next one has not begun
+    until = next_departure_us + 1.0 / column.cantilever.frequency_khz
     rebound = velocity_nm_per_us - column.platform.velocity(departure_us)
     departures = jnp.stack([omega * departure_us, rebound], axis=-1).reshape(-1, 2)
     of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)

@@ -36,11 +36,6 @@ from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import power_of_two
 from afm_jax.units import within_turn
 
-_SAMPLES_PER_TURN = 32
-"""Heights computed of a flight for every period of the faster of drive and tip."""
-_MOST_SAMPLES = 4096
-_RESTING_PERIODS = 1.25
-"""Response periods searched of a tip that meets nothing: more than one, so that its nearest approach is inside."""
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
 FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
 """Kinds of special points, by the numbers of the test functions that are 0 there (`LoopFamily.tests`)."""
@@ -138,28 +133,22 @@ def trace_and_determinant_of(
 
     before = surface.velocity(impacts.arrival_us) - impacts.speeds.approach
     parts = jax.vmap(step_of_map)(impacts.leaving_us, impacts.velocity, impacts.duration_us, jnp.roll(before, -1))
-    whole = reduce(lambda product, part: part @ product, list(parts))
+    return trace_and_determinant(parts)
+
+
+def trace_and_determinant(maps: Float[Any, "m 2 unknowns"]) -> tuple[Any, Any]:
+    """Return T and D of linearised maps one after the other, by their first two unknowns."""
+    whole = reduce(lambda product, each: each[:, :2] @ product, list(maps), np.eye(2))
     # the determinant as a product of those of the parts: that of the whole cancels
-    each = parts[:, 0, 0] * parts[:, 1, 1] - parts[:, 0, 1] * parts[:, 1, 0]
-    return whole[0, 0] + whole[1, 1], jnp.prod(each)
+    return whole[0, 0] + whole[1, 1], (maps[:, 0, 0] * maps[:, 1, 1] - maps[:, 0, 1] * maps[:, 1, 0]).prod()
 
 
-def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Float[Array, ""]:
-    """Return the lowest point of a closed loop's flights above the surface in nm, differentiable; see `lowest_gap`.
-
-    Args:
-        unknowns: of the loop.
-        loop: what it closes.
-        samples: heights computed in every flight.
-    """
-    return lowest_gap(loop.cantilever, loop.surface, _flights(unknowns, loop), samples)
-
-
-def _flights(unknowns: Float[Array, " n"], loop: ImpactLoop) -> tuple[Float[Array, " m"], ...]:
+def flights_of(unknowns: Float[Array, " n"], loop: ImpactLoop) -> tuple[Float[Array, " m"], ...]:
     """Return the flights of a loop as `lowest_gap` takes them; of a tip that meets nothing its rest in the frame."""
     if unknowns.shape[0] == 0:
         zero = jnp.zeros((1,))
-        return zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
+        # more than one response period, so that the nearest approach is inside
+        return zero, zero, zero, zero, 1.25 * loop.period_us[None]
     impacts = impacts_at(unknowns, loop)
     # a flight counts from max(t_in, t_out) on
     first = jnp.maximum(-impacts.speeds.delay, 0.0)
@@ -231,7 +220,7 @@ def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
 
 def highest_point(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Array:
     """Return the largest height of the tip above its rest position, in nm."""
-    return highest_of_flights(loop.cantilever, loop.response, _flights(unknowns, loop), samples)
+    return highest_of_flights(loop.cantilever, loop.response, flights_of(unknowns, loop), samples)
 
 
 def highest_of_flights(
@@ -286,7 +275,7 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
     Args:
         unknowns: of the loop.
         loop: what it closes.
-        samples: of `nearest_approach`.
+        samples: of `lowest_gap`.
     """
     trace, determinant = trace_and_determinant_of(unknowns, loop)
     impacts = impacts_at(unknowns, loop)
@@ -312,7 +301,7 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
 class LoopFamily(eqx.Module):
     """Closed loops of a scene whose parameters move: what is solved along a curve of them, and in which units.
 
-    Loops of laws (`LawLoops`) and of simulated contacts (`ContactLoops`) differ in its five methods. What is static
+    Loops of laws (`LawLoops`) and of simulated contacts (`ContactLoops`) differ in its methods. What is static
     makes a program of its own.
     """
 
@@ -344,9 +333,10 @@ class LoopFamily(eqx.Module):
         low, high = (jnp.asarray([getattr(given, end) for given in ranges], float) for end in ("low", "high"))
         paths, driven = tuple(given.path for given in ranges), driven_part(scene)
         ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
-        heights = power_of_two(math.ceil(_SAMPLES_PER_TURN * order * max(1.0, ratio)), 64)
+        # for every period of the faster of drive and tip
+        heights = power_of_two(math.ceil(32 * order * max(1.0, ratio)), 64)
         numbers = scene, jnp.asarray(float(order)), jnp.ones(()), low, high - low, paths, driven
-        return cls(*numbers, min(_MOST_SAMPLES, heights), **settings)
+        return cls(*numbers, min(4096, heights), **settings)
 
     @abc.abstractmethod
     def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
@@ -382,9 +372,9 @@ class LoopFamily(eqx.Module):
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
 
-    @abc.abstractmethod
-    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
+    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:  # noqa: ARG002
         """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
+        return False
 
     def scene_at(self, values: Any) -> Scene:
         """Return the scene where the parameters have some values, which may be traced."""

@@ -23,8 +23,9 @@ from afm_jax.dynamics.impact_loop import (
     LoopFamily,
     LoopReading,
     closing_gaps,
+    flights_of,
     impacts_at,
-    nearest_approach,
+    lowest_gap,
     reading_of,
     rolled_states,
     trace_and_determinant_of,
@@ -44,25 +45,12 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 
 BLOCK = 64
 """Loops read together: one program."""
-DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
 """m: the linear system that closes a loop has twice as many unknowns."""
 _WINDOWS = (0, 1, 2, 4, 8, 16, 48)
 """Impacts after a start at which a window may begin."""
-_CLOSING = Newton(rounds=30, step_tolerance=1e-14)
-_TURN = 0.5
-"""Longest step of Newton's method in a phase, rad."""
-_SHARE = 0.7
-"""Longest step towards capture, of the distance from it."""
 _CLOSED = 1e-11
 """Largest distance from closing, of the loop's speeds: 1e-12, and what heights of many periods lose by rounding."""
-_GRAZES = 1e-8
-"""Coordinate above capture, over the drive's speed, up to which an impact is none."""
-_SAME = 1e-7
-"""Relative distance below which two loops are one."""
-_FASTEST = 100.0
-"""Of the speeds that starts have, over the drive's."""
-_STEPS = 2000
 IMPACT_COLUMNS = (
     *("phase_rad", "velocity_after_nm_per_us", "velocity_before_nm_per_us"),
     *("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us"),
@@ -154,18 +142,36 @@ class LawLoops(LoopFamily):
 
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
         """Return the closing conditions and the wanted test function at a point of a curve."""
-        return EquationsAt(*(np.asarray(part) for part in _linearised(self, jnp.asarray(point))))
+        return EquationsAt(*map(np.asarray, self._value_and_slopes(point)))
+
+    @jax.jit
+    def _value_and_slopes(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
+        def twice(point: Array) -> tuple[Array, Array]:
+            value = self.equations(point)
+            return value, value
+
+        slopes, value = jax.jacfwd(twice, has_aux=True)(point)
+        return value, slopes
 
     def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
         """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
-        tests, delay = _tests_and_delay(self, jnp.asarray(solved.x))
+        tests, delay = self._tests_and_delay(solved.x)
         return np.asarray(tests), float(delay)
+
+    @jax.jit
+    def _tests_and_delay(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
+        unknowns, loop = self.at(point)
+        delays = jnp.abs(impacts_at(unknowns, loop).speeds.delay) * loop.angular_frequency / (2.0 * jnp.pi)
+        return jnp.stack(self.test_functions(unknowns, loop)), jnp.max(delays, initial=0.0)
 
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
         some = points if len(points) else np.ones((1, points.shape[1]))
-        read = in_blocks(lambda block: _read(self, block), some, block=BLOCK, widths=())
-        return jax.tree.map(lambda leaf: leaf[: len(points)], read)
+        return jax.tree.map(lambda leaf: leaf[: len(points)], in_blocks(self._read, some, block=BLOCK, widths=()))
+
+    @jax.jit
+    def _read(self, points: Float[Array, "points n"]) -> LoopReading:
+        return jax.vmap(lambda point: reading_of(*self.at(point), self.samples))(points)
 
     def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
         """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
@@ -188,7 +194,7 @@ class LawLoops(LoopFamily):
     def test_functions(self, unknowns: Array, loop: ImpactLoop) -> list[Array]:
         """Return the test functions in the order of `KINDS`, without dimension."""
         trace, determinant = trace_and_determinant_of(unknowns, loop)
-        near = nearest_approach(unknowns, loop, self.samples)
+        near = lowest_gap(loop.cantilever, loop.surface, flights_of(unknowns, loop), self.samples)
         if self.test == CAPTURE:
             near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
         speeds = unknowns[unknowns.shape[0] // 2 :]
@@ -214,30 +220,8 @@ def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
     return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
 
 
-@jax.jit
-def _linearised(family: LawLoops, point: Array) -> tuple[Array, Array]:
-    def twice(point):
-        value = family.equations(point)
-        return value, value
-
-    slopes, value = jax.jacfwd(twice, has_aux=True)(point)
-    return value, slopes
-
-
-@jax.jit
-def _tests_and_delay(family: LawLoops, point: Array) -> tuple[Array, Array]:
-    unknowns, loop = family.at(point)
-    delays = jnp.abs(impacts_at(unknowns, loop).speeds.delay) * loop.angular_frequency / (2.0 * jnp.pi)
-    return jnp.stack(family.test_functions(unknowns, loop)), jnp.max(delays, initial=0.0)
-
-
-@jax.jit
-def _read(family: LawLoops, points: Array) -> LoopReading:
-    return jax.vmap(lambda point: reading_of(*family.at(point), family.samples))(points)
-
-
 @checked
-def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
+def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 512) -> ManyImpactOrbits:
     """Return the orbits of m impacts in N drive periods that a search from many starts finds.
 
     Args:
@@ -315,13 +299,16 @@ def _search(family: LawLoops, starts: Float[Array, "starts 2"], *, impacts: int)
     capture = loop.impact.lowest / loop.speed_unit
 
     def damped(unknowns: Array, step: Array) -> Array:
-        nearer = -_SHARE * (unknowns[impacts:] - capture)
-        return jnp.concatenate([jnp.clip(step[:impacts], -_TURN, _TURN), jnp.maximum(step[impacts:], nearer)])
+        # half a radian at most, and towards capture not quite the distance from it
+        nearer = -0.7 * (unknowns[impacts:] - capture)
+        return jnp.concatenate([jnp.clip(step[:impacts], -0.5, 0.5), jnp.maximum(step[impacts:], nearer)])
 
-    loops = jax.vmap(lambda guess: newton(closing_gaps, guess, loop, _CLOSING._replace(damping=damped)).x)(guesses)
+    settings = Newton(rounds=30, step_tolerance=1e-14, damping=damped)
+    loops = jax.vmap(lambda guess: newton(closing_gaps, guess, loop, settings).x)(guesses)
     missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, loop))))(loops)
     # a free motion that touches the surface is no orbit of impacts
-    leaves = jnp.min(loops[:, impacts:], axis=1) > capture + _GRAZES
+    # above capture by less, over the drive's speed, an impact is none
+    leaves = jnp.min(loops[:, impacts:], axis=1) > capture + 1e-8
     return loops, usable & (missing < _CLOSED) & leaves
 
 
@@ -332,8 +319,9 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
 
     def walk(start):
         time = start[0] * 2.0 * jnp.pi / loop.angular_frequency
-        velocity = surface.velocity(time) + surface.top_speed_nm_per_us * 0.03 * (_FASTEST / 0.03) ** start[1]
-        rows = follow_impacts(seen, Departure(time, None, velocity), tolerance, impacts=length, max_steps=_STEPS)
+        # up to a hundred times the drive's
+        velocity = surface.velocity(time) + surface.top_speed_nm_per_us * 0.03 * (100.0 / 0.03) ** start[1]
+        rows = follow_impacts(seen, Departure(time, None, velocity), tolerance, impacts=length, max_steps=2000)
         hit = rows.outcome == Outcome.IMPACT
         arrival = jnp.where(hit, rows.arrival_time_us, 0.0)
         approach = surface.velocity(arrival) - rows.velocity_before_nm_per_us
@@ -355,7 +343,8 @@ def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[n
         speeds = np.roll(speeds, -first)
         rolled = rolled_states(np.append(turned, speeds / speeds.max()))
         shorter = [shift for shift in range(1, count) if count % shift == 0]
-        if not any((np.abs(others - rolled[0]).max(axis=(1, 2)) < _SAME).any() for others in (rolled[shorter], known)):
+        # relative to the hardest impact, nearer loops are one
+        if not any((np.abs(others - rolled[0]).max(axis=(1, 2)) < 1e-7).any() for others in (rolled[shorter], known)):
             known = np.concatenate([known, rolled])
             result.append(np.append(turned, speeds))
     return np.array(result).reshape(-1, 2 * count)

@@ -41,21 +41,12 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 
 MAX_STEPS = 2000
 """Steps of the search for one impact."""
-_QUICK_STEPS = 14
-"""Steps of the search that all tips of a block take together; those that need more go on among themselves."""
-_RIDE_PERIODS = 1.1
-"""Drive periods for which a rest is followed. The push on a resting tip repeats every drive period: a tip that one
-period does not release is held for ever."""
 _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
 _ROWS = 40
 """Contacts of one stretch, which is one call of `simulate`."""
-_PERIODS_EACH = 6.0
-"""Duration of a stretch per contact, in periods of the drive or of the free tip, whichever is longer."""
 CONTACTS_AT_ONCE = 128
 """Contacts followed together, each with its derivatives."""
-_AWAY = 30.0
-"""Time without a contact after which the tip counts as having left the sample, in these longer periods."""
 
 
 class Tips(NamedTuple):
@@ -126,7 +117,8 @@ def advance(scenes: Scene, tips: Tips) -> tuple[Tips, Record]:
     if len(tips.time_us) <= _FEW:
         ends_of_flights = ends(MAX_STEPS)(scenes, flights)
     else:
-        ends_of_flights = ends(_QUICK_STEPS)(scenes, flights)
+        # steps that all take together; those that need more go on among themselves
+        ends_of_flights = ends(14)(scenes, flights)
         slow = ends_of_flights.outcome == Outcome.STEP_LIMIT
         ends_of_flights = again_for(ends(MAX_STEPS), slow, (scenes, flights), ends_of_flights, block=_FEW)
     return after_impacts(scenes, tips, jax.vmap(impact_at_end)(scenes, flights, ends_of_flights))
@@ -213,7 +205,8 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
 def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""], Bool[Array, ""]]:
     """Return where the flight after an impact begins, whether the tip rests before, and whether it rests for ever."""
     landed = (impact.outcome == Outcome.IMPACT) | (impact.outcome == Outcome.CAPTURED)
-    until = jnp.where(landed, impact.arrival_time_us, 0.0) + _RIDE_PERIODS * scene.platform.period_us
+    # the push on a resting tip repeats every drive period: one that a period does not release is held for ever
+    until = jnp.where(landed, impact.arrival_time_us, 0.0) + 1.1 * scene.platform.period_us
     row, departure, _ = through_impact(scene, impact, landed, until)
     held = row.kind == ContactKind.HELD
     rested = (row.kind == ContactKind.CHATTER) | (impact.outcome == Outcome.CAPTURED)
@@ -261,8 +254,10 @@ def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, ac
 
 def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     """Return tips after the next 40 contacts, simulated together, and these contacts."""
-    period, slower = np.asarray(scenes.platform.period_us), _slower_period_us(scenes)
-    motion = jax.tree.map(np.asarray, _followed(scenes, tips, _PERIODS_EACH * _ROWS * slower, accuracy=accuracy))
+    period = np.asarray(scenes.platform.period_us)
+    slower = np.maximum(period, 2.0 * np.pi / np.asarray(scenes.cantilever.angular_frequency))
+    # so many of the longer periods for each contact
+    motion = jax.tree.map(np.asarray, _followed(scenes, tips, 6.0 * _ROWS * slower, accuracy=accuracy))
     contacts = motion.contacts
     going = tips.outcome == Outcome.IMPACT
     leaves = (contacts.kind == ContactKind.IMPACT) & going[:, None]
@@ -273,7 +268,8 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     since = motion.final.time_us - np.nanmax(np.column_stack([tips.time_us, departure]), axis=1)
     held = (motion.phase != ContactPhase.DRY) & (since > HELD_PERIODS * slower)
     outcome = np.select(
-        [full, held, since > _AWAY * slower],
+        # so long without a contact the tip counts as having left the sample
+        [full, held, since > 30.0 * slower],
         [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
         Outcome.STEP_LIMIT,
     ).astype(np.int32)
@@ -340,8 +336,3 @@ def next_departures(
         return following, slopes, contact, there
 
     return jax.vmap(of_one)(scenes, departures, until_rad)
-
-
-def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:
-    free = 2.0 * np.pi / np.asarray(scenes.cantilever.angular_frequency)
-    return np.maximum(np.asarray(scenes.platform.period_us), free)

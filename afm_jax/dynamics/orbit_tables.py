@@ -20,16 +20,6 @@ from afm_jax.words import counted
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_OF_AN_ORBIT = (
-    *("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
-    *("trace", "determinant", "stable", "admissible", "near_double"),
-)
-_OF_A_DRIVEN_TIP = (
-    *("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg", "peak_deflection_nm"),
-    *("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
-    *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
-)
-"""Further columns of a tip that base or force drives; those of the deflection over a moving base only."""
 _IMPACT_CELLS: dict[str, Cell] = {
     "phase\nrad": "phase_rad",
     "velocity after\nnm/us": "velocity_after_nm_per_us",
@@ -67,8 +57,16 @@ class OrbitTable(NamedTuple):
         """What is told in a row of an orbit: attributes of orbits of such a scene; of several impacts the first's."""
         if self.impacts is not None:
             return (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
-        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.orbits, name) is not None)
-        return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
+        driven = (
+            *("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg", "peak_deflection_nm"),
+            *("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
+            *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg", "extrapolated"),
+        )
+        return (
+            *(*IMPACT_COLUMNS, "peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
+            *("trace", "determinant", "stable", "admissible", "near_double"),
+            *(name for name in driven if getattr(self.orbits, name) is not None),
+        )
 
     @property
     def reason(self) -> str | None:
@@ -117,7 +115,7 @@ class OrbitTable(NamedTuple):
             "orbit": "orbit:d",
             **_IMPACT_CELLS,
             "peak\nnm": "peak_amplitude_nm",
-            "multipliers": lambda row: ", ".join(map(_multiplier, row["multipliers"])),
+            "multipliers": lambda row: ", ".join(f"{complex(*z) if z[1] else z[0]:.4g}" for z in row["multipliers"]),
             "stable": "stable",
         }
         title = f"Orbits with {counted(impacts, 'impact')} in {counted(self.order, 'drive period')}"
@@ -133,10 +131,6 @@ class OrbitTable(NamedTuple):
             "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], self._columns),
             "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
         }
-
-
-def _multiplier(parts: list[float]) -> str:
-    return f"{complex(*parts):.4g}" if parts[1] else f"{parts[0]:.4g}"
 
 
 def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> str:
@@ -162,11 +156,9 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
         )
     reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
     nearest = max(1, round(reduced))
-    what = (
-        f"in every orbit of order {order} the tip would have to pass through the platform"
-        if rejected
-        else f"there is no orbit of order {order}"
-    )
+    what = f"there is no orbit of order {order}"
+    if rejected:
+        what = f"in every orbit of order {order} the tip would have to pass through the platform"
     if nearest != order:
         return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try `order={nearest}`"
     return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"

@@ -6,7 +6,7 @@ In two parameters the closing equations together with the test function are foll
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,12 +27,6 @@ from afm_jax.scenefile.parameter_paths import ParameterRange
 
 _ASIDE = 1e-5
 """Of a step between points: how far to either side of a grazing or a capture is looked."""
-_AT_AN_END = 1e-3
-"""Test function below which a curve has been lost at its root."""
-_SAME_POINT = 1e-7
-"""Of the range: distance below which special points of one kind that follow each other are one."""
-_LONG_ENOUGH = 1e-5
-"""Length over which is extrapolated from there."""
 
 
 class SpecialPoint(NamedTuple):
@@ -47,7 +41,8 @@ class SpecialPoint(NamedTuple):
     """Where on it, in points: 2.5 is between the third and the fourth."""
     admissible: bool
     """Whether the map flies the orbit (at a grazing and a capture: on one side)."""
-    unknowns: Float[np.ndarray, " n"]
+    point: Float[np.ndarray, " n"]
+    """On the curve: the unknowns of its loop, and the parameter as a fraction of its range."""
     reading: LoopReading
     test: int
     """Number of the test function that vanishes."""
@@ -57,7 +52,8 @@ class OrbitBranch(NamedTuple):
     """An orbit followed through the range, both ways from where it was found."""
 
     parameter: Float[np.ndarray, " points"]
-    unknowns: Float[np.ndarray, "points n"]
+    points: Float[np.ndarray, "points n"]
+    """On the curve, as of a `SpecialPoint`."""
     reading: LoopReading
     ends: tuple[str, str]
     """Why it ends there, at either end."""
@@ -110,9 +106,11 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
         if root.test == CAPTURE and kind == KINDS[GRAZING] and not admissible:
             # the tip rests while the sample goes through it: no motion comes to that
             continue
-        unknowns, parameter = root.point.point[:-1], low + width * float(root.point.point[-1])
-        point = SpecialPoint(kind, parameter, number, root.position, admissible, unknowns, reading, root.test)
-        near = special and abs(special[-1].parameter - parameter) < _SAME_POINT * width
+        at = root.point.point
+        parameter = low + width * float(at[-1])
+        point = SpecialPoint(kind, parameter, number, root.position, admissible, at, reading, root.test)
+        # of the range
+        near = special and abs(special[-1].parameter - parameter) < 1e-7 * width
         if near and special[-1].kind == kind:
             # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
             special[-1] = special[-1]._replace(admissible=special[-1].admissible or admissible)
@@ -137,16 +135,13 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
             if test == CAPTURE:
                 # there the branch ends: its last point is beside it
                 position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
-            roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, family)]))
+            seen = [point]
+            if test in (GRAZING, CAPTURE):
+                # on one side the orbit may be flown
+                beside = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
+                seen += [each for each in beside if each is not None]
+            roots.append(_Root(position, test, point, [each.point for each in seen]))
     return roots
-
-
-def _beside(leg: CurveLeg, fraction: float, test: int, family: LoopFamily) -> list[np.ndarray]:
-    """Return the points on either side of a grazing or a capture: on one of them the orbit may be flown."""
-    if test not in (GRAZING, CAPTURE):
-        return []
-    points = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
-    return [point.point for point in points if point is not None]
 
 
 def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
@@ -160,12 +155,14 @@ def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
         if curve.ends[end] != "lost":
             continue
         last, position = steps[-1], float(end * len(curve.legs))
-        far = (step for step in reversed(steps) if np.linalg.norm(step.point - last.point) > _LONG_ENOUGH)
+        # it is extrapolated over this length
+        far = (step for step in reversed(steps) if np.linalg.norm(step.point - last.point) > 1e-5)
         before = next(far, steps[0])
         for test in (GRAZING, CAPTURE):
             left, earlier = float(last.tests[test]), float(before.tests[test])
             # infinite where no flight has a lowest point
-            if 0.0 <= left < _AT_AN_END and left < earlier:
+            # of a test function at whose root the curve was lost
+            if 0.0 <= left < 1e-3 and left < earlier:
                 ahead = left / (earlier - left) * (last.point - before.point)
                 roots.append(_Root(position, test, last._replace(point=last.point + ahead), [last.point]))
     return roots
@@ -192,8 +189,7 @@ def special_curves(
     for point in special:
         if not point.admissible:
             continue
-        fraction = (point.parameter - float(family.low[0])) / float(family.width[0])
-        start = np.concatenate([point.unknowns, [fraction, (value - second.low) / (second.high - second.low)]])
+        start = np.append(point.point, (value - second.low) / (second.high - second.low))
         with_test = replace(family, test=point.test)
         if any(lies_on(start, curve, with_test) for test, curve in followed if test == point.test):
             continue
@@ -210,17 +206,17 @@ def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> Speci
     others = [GRAZING] if family.test == CAPTURE else [test for test in range(len(KINDS)) if test != family.test]
     meetings = []
     for leg in curve.legs:
-        for test in others:
-            root = root_on(leg, tested_by(test, family), family)
-            if root is not None:
-                other = _kind_of(test, root[1], family)
-                # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
-                if other != kind:
-                    meetings.append(Meeting(f"{kind}_{other}", *(low + width * root[1].point[-2:]).tolist()))
+        functions: list[tuple[int | None, Any]] = [(test, tested_by(test, family)) for test in others]
         if family.test == FOLD:
-            root = root_on(leg, _cusp_function(leg), family)
-            if root is not None:
-                meetings.append(Meeting("cusp", *(low + width * root[1].point[-2:]).tolist()))
+            functions.append((None, _cusp_function(leg)))
+        for test, function in functions:
+            root = root_on(leg, function, family)
+            if root is None:
+                continue
+            name = "cusp" if test is None else f"{kind}_{_kind_of(test, root[1], family)}"
+            # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
+            if name != f"{kind}_{kind}":
+                meetings.append(Meeting(name, *(low + width * root[1].point[-2:]).tolist()))
     values = low + width * curve.points[:, -2:]
     if family.test in (GRAZING, CAPTURE):
         # they are the border of what the map flies: only the other border can be passed

@@ -27,12 +27,6 @@ from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import in_blocks
 
-_TOUCHING = 1e-13
-"""Gap over the heights it is the difference of, below which it is rounding."""
-_ORBITS_AT_ONCE = 128
-_RISEN = 0.9
-"""Fraction of the gap at which contact ends: a tip that comes so far on a straight path's time comes there."""
-
 
 class SampleDriven(NamedTuple):
     """Scenes as their freely moving tips see them, whatever drives them: over a platform that moves with one cosine."""
@@ -122,8 +116,8 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
 
     def first_impact_of(scene: Scene, start: State) -> NextImpact:
         gap = start.position_nm - scene.platform.position(start.time_us)
-        # on the surface but for rounding
-        gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
+        # on the surface but for the rounding of the heights it is the difference of
+        gap = jnp.where(jnp.abs(gap) < 1e-13 * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
         departure = Departure(start.time_us, gap, start.velocity_nm_per_us)
         return or_rest(scene, departure, impact_after(scene, departure, Search(MAX_STEPS, from_above=True)))
 
@@ -167,7 +161,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
     def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
         return _on_orbits(*lanes)
 
-    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=_ORBITS_AT_ONCE)
+    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=128)
     return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
 
 
@@ -183,8 +177,8 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
         start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
         rise = clearance / orbit.speeds.rebound
         height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
-        # the path bends by less than this, where it rises at all
-        risen = height - platform.position(start + rise) >= _RISEN * clearance
+        # a tip that comes so far in a straight path's time comes there: the path bends by less, where it rises at all
+        risen = height - platform.position(start + rise) >= 0.9 * clearance
         return steady & risen & law.leaves, (start + rise) % platform.period_us, speed
 
     there, time, velocity = jax.vmap(on_orbit_of)(scenes, clearance_nm)

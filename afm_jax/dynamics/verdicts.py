@@ -1,7 +1,6 @@
 """How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample."""
 
 import enum
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -62,20 +61,12 @@ REPEATED = 2
 RECORDED = (2 * REPEATED + 1) * LONGEST
 """Impacts that are recorded to tell orbits of up to `LONGEST` impacts."""
 
-_SETTLED, _SETTLED_CONTACT = 1e-6, 1e-4
-"""Estimated distance from an orbit below which a motion is on it, with laws and with resolved contacts."""
-
-_KIND_OF = {
-    Outcome.IMPACT: MotionKind.IRREGULAR,
-    Outcome.CAPTURED: MotionKind.STUCK,
-    Outcome.NO_FURTHER_IMPACT: MotionKind.FREE,
-}
-
 
 def kinds_of(outcome: Int[np.ndarray, " lanes"]) -> Int[np.ndarray, " lanes"]:
     """Return the kinds of motions that ended with an `Outcome` each; irregular while they go on."""
     kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
-    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
+    kinds[Outcome.IMPACT], kinds[Outcome.CAPTURED] = MotionKind.IRREGULAR, MotionKind.STUCK
+    kinds[Outcome.NO_FURTHER_IMPACT] = MotionKind.FREE
     return kinds[outcome]
 
 
@@ -95,7 +86,6 @@ def motions_of(
     *,
     accuracy: float,
     block: int = LANES,
-    widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
 ) -> Motions:
     """Return what tips come to after some impacts.
@@ -105,16 +95,15 @@ def motions_of(
         tips: at the beginning of a flight each.
         impacts: how many, those recorded included.
         accuracy: of resolved contacts.
-        block: as of `in_blocks`, and so the rest.
-        widths: of smaller blocks.
+        block: lanes that are followed together; fewer than usual are always so many, in one program.
         report: called with how many of how many tips are done.
     """
 
     def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
         return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=accuracy)
 
-    end, record = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
-    tolerance = _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
+    end, record = in_blocks(work, (scenes, tips), block=block, widths=WIDTHS if block == LANES else (), report=report)
+    tolerance = 1e-4 if isinstance(scenes.interaction, Contact) else 1e-6
     period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
     return Motions(end, record, verdicts_of(record, end.outcome, period, tolerance=tolerance))
 

@@ -25,7 +25,7 @@ from afm_jax.contact.junction import ContactPhase, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab, where
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import compiled_quickly, filled, power_of_two
+from afm_jax.solve.lanes import filled, power_of_two
 
 _BLOCK, _FEWEST = 128, 8
 """Trials computed in one call, and contacts at least."""
@@ -248,7 +248,7 @@ def fly(
 _force = jax.jit(force_in_phase)
 
 
-@compiled_quickly()
+@jax.jit
 def _some_trials(
     driven: Driven, tip: TipInContact, until: Float[Array, ""]
 ) -> tuple[TipInContact, tuple[tuple[Array, ...], Bool[Array, "trials contacts"]]]:

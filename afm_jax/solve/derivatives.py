@@ -185,10 +185,6 @@ batching.primitive_batchers[_absent] = lambda numbers, axes: (_absent.bind(*numb
 ad.deflinear2(_absent, lambda asked, _: [jnp.where(asked == 0.0, 0.0, jnp.nan)])
 
 
-_FORWARD_BY = 4
-"""Numbers of a tip up to which passes forward take less time than one in reverse mode, whatever the batch."""
-
-
 def by_tangents(
     function: Callable[..., tuple[Any, Array]], *arguments: Any, small: bool, settings: tuple[Hashable, ...]
 ) -> Any:
@@ -254,7 +250,8 @@ def _differentiable(work: _Work, leaves: Sequence[Array], *, small: bool) -> Any
 
     def derivative(values, tangents):
         moving = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
-        if not small and len(moving) > _FORWARD_BY:
+        # up to so many, passes forward take less time than one in reverse mode, whatever the batch
+        if not small and len(moving) > 4:
             given = [tangents[i] if i in moving else jnp.zeros_like(value) for i, value in enumerate(values)]
             return jax.jvp(work.of, values, tuple(given))
         more = work._replace(moving=(*work.moving, moving))

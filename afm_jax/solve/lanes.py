@@ -64,7 +64,7 @@ def in_blocks(
         report: called with how far it is, from the second block on.
     """
     count = len(jax.tree.leaves(lanes)[0])
-    width = next((width for width in widths if width >= min(count, block)), block)
+    width = min(block, next((width for width in widths if width >= count), block))
     whole = jax.tree.map(np.asarray, lanes)
 
     def part(first: int) -> Any:

@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 
 _FIRST, _LESS, _MORE, _SMALLEST, _LARGEST = 1e-3, 0.1, 8.0, 1e-9, 1e8
 """Damping in units of every unknown's own curvature: the first, its factors after steps taken and refused, its ends."""
-_SURELY = 0.1
-"""Damping below which a small fall of the sum means that a minimum is near."""
 
 
 class Sum(NamedTuple):
@@ -82,7 +80,8 @@ def levenberg_marquardt(  # noqa: PLR0913
         if there is None:
             break
         fall, place, here = here.value - there.value, place + step, there
-        if 0.0 <= fall < settled * (1.0 if damping < _SURELY else 1e-3):
+        # with little damping a small fall means that a minimum is near
+        if 0.0 <= fall < settled * (1.0 if damping < 0.1 else 1e-3):
             break
         damping = max(_LESS * damping, _SMALLEST)
     return Lowest(place, here, count, _step(here, moves(), _SMALLEST)[1])
@@ -97,10 +96,6 @@ def _step(here: Sum, moving: Bool[np.ndarray, " k"], damping: float) -> tuple[Fl
     return step, -float(gradient @ step[moving])
 
 
-_FLAT = 1e-12
-"""Curvature, where every parameter's own is 1, below which a direction is not determined."""
-
-
 def covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p p"]:
     """Return the inverse of Fisher matrices; rows and columns of parameters that one does not determine are infinite.
 
@@ -113,7 +108,8 @@ def covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "..
     unit = safe[..., :, None] * safe[..., None, :]
     # parameters may be of very different size
     curvature, axes = np.linalg.eigh(sound / unit)
-    flat = curvature < _FLAT
+    # where every parameter's own curvature is 1, a smaller one does not determine a direction
+    flat = curvature < 1e-12
     undetermined = np.any((np.abs(axes) > 1e-6) & flat[..., None, :], axis=-1)
     inverse = (axes / np.where(flat, np.inf, curvature)[..., None, :]) @ np.swapaxes(axes, -2, -1) / unit
     return np.where(undetermined[..., :, None] | undetermined[..., None, :] | ~finite, np.inf, inverse)

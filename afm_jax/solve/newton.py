@@ -141,11 +141,6 @@ class LinearisedRows(NamedTuple):
     details: Sequence[Any] | None = None
     """What else the evaluation has found, one a row."""
 
-    def of(self, rows: Int[np.ndarray, " some"]) -> "LinearisedRows":
-        """Return the equations of some of the rows."""
-        details = None if self.details is None else [self.details[row] for row in rows]
-        return LinearisedRows(self.residual[rows], self.slopes[rows], details)
-
 
 class Roots(NamedTuple):
     """Where the searches of all rows ended."""
@@ -191,33 +186,23 @@ def newton_rows(
         here = linearised(roots.x[rows], rows)
         size = np.linalg.norm(here.residual, axis=1)
         too_far = ~(size < lowest[rows]) if settings.halvings else np.zeros(len(rows), bool)
-        on, back = rows[~too_far], rows[too_far]
-        step[back] *= 0.5
-        roots.x[back] -= step[back]
-        halved[back] += 1
-        lowest[on], halved[on] = size[~too_far], 0
-        step[on] = _advance(roots, on, here.of(np.flatnonzero(~too_far)), settings)
-        given_up = back[halved[back] > settings.halvings]
+        full, sizes = settings.limited(roots.x[rows], -_solved(here.slopes, here.residual))
+        finite = np.isfinite(full).all(axis=1)
+        small = np.all(np.abs(here.residual) <= settings.residual_tolerance, axis=1)
+        found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)
+        roots.outcome[rows[found & ~too_far]] = NewtonOutcome.CONVERGED
+        roots.outcome[rows[~finite & ~too_far]] = NewtonOutcome.NO_STEP
+        roots.slopes[rows[~too_far]] = here.slopes[~too_far]
+        for row, detail in zip(rows, here.details or (), strict=bool(here.details)):
+            roots.details[row] = detail
+        # a step that does not lower the norm is taken back by half
+        step[rows] = np.where(too_far[:, None], 0.5 * step[rows], np.where(finite[:, None], full, 0.0))
+        roots.x[rows] += np.where(too_far[:, None], -step[rows], step[rows])
+        lowest[rows], halved[rows] = np.fmin(size, lowest[rows]), np.where(too_far, halved[rows] + 1, 0)
+        given_up = rows[halved[rows] > settings.halvings]
         roots.x[given_up] -= step[given_up]
         rows = np.setdiff1d(rows[roots.outcome[rows] == NewtonOutcome.NOT_CONVERGED], given_up)
     return roots
-
-
-def _advance(
-    roots: Roots, rows: Int[np.ndarray, " some"], here: LinearisedRows, settings: Newton
-) -> Float[np.ndarray, "some n"]:
-    """Take a step from the points of some rows, write down what becomes of them, and return the step."""
-    x = roots.x[rows]
-    step, sizes = settings.limited(x, -_solved(here.slopes, here.residual))
-    finite = np.isfinite(step).all(axis=1)
-    roots.x[rows] = np.where(finite[:, None], x + step, x)
-    small = np.all(np.abs(here.residual) <= settings.residual_tolerance, axis=1)
-    found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)
-    roots.outcome[rows[found]], roots.outcome[rows[~finite]] = NewtonOutcome.CONVERGED, NewtonOutcome.NO_STEP
-    roots.slopes[rows] = here.slopes
-    for row, detail in zip(rows, here.details or (), strict=bool(here.details)):
-        roots.details[row] = detail
-    return step
 
 
 def _solved(slopes: Float[np.ndarray, "rows n n"], right: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-_MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
 _SETTLED = 1e-12  # the last relative step; it has been cubed by then
 
 
@@ -28,21 +27,9 @@ def real_roots(
     """
     if coefficients.shape[0] == 3:
         return _quadratic_roots(coefficients, low, high)
-    inner, _ = real_roots(_derivative(coefficients), low, high)
+    inner, _ = real_roots(jnp.polyder(coefficients), low, high)
     knots = jnp.concatenate([low[None], inner, high[None]])
     return _monotone_roots(coefficients, knots[:-1], knots[1:])
-
-
-def evaluate(coefficients: Float[Array, " n"], x: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Return the polynomial's values (Horner)."""
-    value = jnp.full_like(x, coefficients[0])
-    for index in range(1, coefficients.shape[0]):
-        value = value * x + coefficients[index]
-    return value
-
-
-def _derivative(coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
-    return coefficients[:-1] * jnp.arange(coefficients.shape[0] - 1, 0, -1, dtype=coefficients.dtype)
 
 
 def _quadratic_roots(coefficients: Float[Array, " 3"], low, high):
@@ -61,9 +48,9 @@ def _quadratic_roots(coefficients: Float[Array, " 3"], low, high):
 def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, " m"]):
     """Laguerre's method kept inside a shrinking bracket, on every interval at once."""
     degree = coefficients.shape[0] - 1
-    first_derivative = _derivative(coefficients)
-    second_derivative = _derivative(first_derivative)
-    value_left, value_right = evaluate(coefficients, left), evaluate(coefficients, right)
+    first_derivative = jnp.polyder(coefficients)
+    second_derivative = jnp.polyder(first_derivative)
+    value_left, value_right = jnp.polyval(coefficients, left), jnp.polyval(coefficients, right)
     # A root on a knot belongs to the interval on its left; one on `low` itself to the first interval.
     first = jnp.arange(left.shape[0]) == 0
     inside = value_left * value_right < 0.0
@@ -72,12 +59,13 @@ def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, 
 
     def unsettled(state):
         step, _, _, x, move = state
-        return (step < _MAX_STEPS) & jnp.any(jnp.abs(move) > _SETTLED * jnp.abs(x))
+        # Laguerre's method needs about 5; bisection alone over the widest interval about 100
+        return (step < 200) & jnp.any(jnp.abs(move) > _SETTLED * jnp.abs(x))
 
     def narrow(state):
         step, a, b, x, move = state
-        value, slope = evaluate(coefficients, x), evaluate(first_derivative, x)
-        bend = evaluate(second_derivative, x)
+        value, slope = jnp.polyval(coefficients, x), jnp.polyval(first_derivative, x)
+        bend = jnp.polyval(second_derivative, x)
         beyond = (value > 0.0) == rising
         a, b = jnp.where(beyond, a, x), jnp.where(beyond, x, b)
         square = (degree - 1) * ((degree - 1) * slope**2 - degree * value * bend)
