@@ -40,6 +40,7 @@ from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretche
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw, closest_delay
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
@@ -497,7 +498,7 @@ def approximate_law(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay, np))
 
 
-@jax.jit
+@compiled_quickly()
 def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
     """Return the table of a contact's free collisions, differentiable in every parameter.
 

@@ -17,7 +17,6 @@ from afm_jax.contact.junction import ContactPhase, Junction, find_junction, forc
 from afm_jax.contact.junction_leg import Stretch, stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import halved
-from afm_jax.solve.lanes import compiled_quickly
 
 _NODES = 64
 _ITERATIONS = 12
@@ -71,7 +70,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     )
 
 
-@compiled_quickly()
+@jax.jit
 def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
 ) -> tuple[Junction, list[Stretch], Float[Array, "3"]]:
