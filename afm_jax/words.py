@@ -85,7 +85,7 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(text, list(known), n=1, cutoff=_SIMILAR)), None)
 
 
-_SIMILAR = 0.7
+_SIMILAR = 0.62
 """Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
 
 
