@@ -13,7 +13,9 @@ A constant pull is exact: the contact takes F(kappa) tau and the integral of its
 to x'' = -x^(3/2) - kappa/3.2181 with x'(0) = 1, they are 3.2181 F and 3.2181^2 H). All else counts to first order:
 
     energy      w^2 grows by 2 H J u^2, the work of j t along the path (by parts, j times the integral of x),
-                and by -(10/9) (F - 1.2 kappa H) (Omega/Q) tau u^2 in the air: the mean squared speed, by the virial
+                and by -(10/9) (F - 1.2 kappa H) (Omega/Q) tau u^2 in the air: the mean squared speed, by the virial;
+                between solid and gap 0 flights lose (Omega/Q) d (u + w) of that already; a bridge, which makes the tip
+                faster, costs 1.74 (Omega/Q) b (u - w) more, and the solid twice the fraction of its depth below
     duration    grows by (F - 1 - 0.0393 (Omega tau)^2) tau: the spring, weak beside the contact, stiffens it
     depth       the integral of the indentation is H (1 - 0.0836 (Omega tau)^2) u tau^2; a lock-in at nu counts what
                 happens away from mid contact less, by 0.0232 (nu tau)^2. The bridge, whose lead is b (1/w - 1/u), keeps
@@ -131,12 +133,15 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     # contact begins at the solid's surface, which the tip reaches from gap 0 under the pull
     at_surface = speed_over(u, raised, pull)
     tau = hertz.time(at_surface)
-    gained, longer = gained_and_longer(at_surface, tau, middle, cantilever)
+    lead, (_, deeper) = jnp.maximum(hertz.lead_nm, 0.0), in_bridge(hertz, u, w)
+    gained, longer = gained_and_longer(at_surface, tau, middle, cantilever, deeper)
+    # the air of the flights counts to gap 0, and in the bridge the tip is faster than there
+    gained = gained + 4.0 * cantilever.decay_rate * (raised * (u + w) - IN_AIR * lead * (u - w))
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
     longer = longer + tau - hertz.time(u) - _lag(u, raised, pull) - _lag(w, raised, pull)
     # by how much later the tip passes the length over which it keeps its energy; of the lead that is its fraction
     later = _lag(w, length, pull) - _lag(u, length, pull)
-    fraction = jnp.maximum(hertz.lead_nm, 0.0) / (USUAL_LEAD * length)
+    fraction = lead / (USUAL_LEAD * length)
     return Speeds(u, rebound, free.delay + longer - fraction * later)
 
 
@@ -164,10 +169,16 @@ SPREAD = 4.6448e-2
 BELOW, FASTER = 0.30, 0.81
 """Depth of the paths through a bridge below straight ones over l b (1/w - 1/u), and how much deeper a Hertz contact is
 over (b/l) (1 - w^2/u^2): what comes closest for twenty contacts."""
+IN_AIR = 0.87
+"""Integral of the squared speed through a bridge less that of straight paths, over b (u - w): likewise."""
 
 
 def gained_and_longer(
-    approach_speed: Float[Array, ""], tau: Float[Array, ""], middle: Middle, cantilever: Cantilever
+    approach_speed: Float[Array, ""],
+    tau: Float[Array, ""],
+    middle: Middle,
+    cantilever: Cantilever,
+    deeper: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return by how much squared speed (nm^2/us^2) and duration (us) of a Hertz contact grow under pull and air.
 
@@ -176,11 +187,12 @@ def gained_and_longer(
         tau: Hertz time in us.
         middle: accelerations at mid contact.
         cantilever: its spring and its damping by the air.
+        deeper: fraction by which a bridge lets the tip go deeper; its squared speed grows by twice that.
     """
     # without units: kappa and J of the equations
     kappa, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
     lasts, deep = hertz_under_pull(kappa)
-    air = AIR * (lasts - 1.2 * jnp.clip(kappa, *PULLS) * deep)
+    air = AIR * (1.0 + 2.0 * deeper) * (lasts - 1.2 * jnp.clip(kappa, *PULLS) * deep)
     gained = 2.0 * (deep * change - air * cantilever.decay_rate * tau)
     return gained * approach_speed**2, (lasts - 1.0 - STIFFER * (cantilever.angular_frequency * tau) ** 2) * tau
 
@@ -234,12 +246,24 @@ def depth_of_impact(
     # the parabolas between the surface and gap 0 are of the flight
     beside = 2.0 * raised / (at_surface + approach_speed)
     flown = beside**2 * (at_surface + 2.0 * approach_speed) / 3.0
-    # the bridge pulls the tip below its straight paths, and makes it faster where it meets the solid
+    drawn, deeper = in_bridge(hertz, approach_speed, rebound_speed)
+    solid = (1.0 + deeper) * indentation(at_surface, tau, middle, cantilever, nu)
+    return solid - raised * lasts * tau + flown + drawn
+
+
+def in_bridge(
+    hertz: HertzContact, approach_speed: Float[Array, "..."], rebound_speed: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return what a bridge pulls a tip below straight paths (nm us), and by which fraction it lets it go deeper.
+
+    Args:
+        hertz: for the lead and length of the bridge.
+        approach_speed: u in nm/us.
+        rebound_speed: w in nm/us.
+    """
     lead, length = jnp.maximum(hertz.lead_nm, 0.0), hertz.length_nm
-    slowed = 1.0 - (rebound_speed / approach_speed) ** 2
     drawn = BELOW * length * lead * (1.0 / rebound_speed - 1.0 / approach_speed)
-    deeper = 1.0 + FASTER * lead / length * slowed
-    return deeper * indentation(at_surface, tau, middle, cantilever, nu) - raised * lasts * tau + flown + drawn
+    return drawn, FASTER * lead / length * (1.0 - (rebound_speed / approach_speed) ** 2)
 
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:
