@@ -116,7 +116,7 @@ def half_width_at_its_word(table: AmplitudeTable, model: str) -> Callable[[np.nd
     return lambda speeds: TWO_SIDED_95 * np.linalg.norm(at(speeds).factor[0], axis=1)
 
 
-INTERVALS = 0.9, 0.98
+INTERVALS = 0.92, 0.99
 """Between which the shares lie of the intervals of r, and of those of epsilon, that hold the truth's projection."""
 
 
