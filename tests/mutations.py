@@ -21,6 +21,7 @@ DELAYED_ORBIT = f"{ORBITS}[delayed]"
 FORWARD = "tests/test_forward.py::"
 LAWS = "tests/test_laws_of_fits.py::"
 LASTING = "tests/test_lasting_impact.py::"
+COURSE = f"{LASTING}test_depth_and_loss_by_the_air_are_those_of_the_course_through_bridge_and_solid"
 LASTING_ORBITS = "tests/test_lasting_orbits.py::"
 INTERVALS = "tests/test_profile_intervals.py"
 FORCES = "tests/test_forces.py::"
@@ -109,6 +110,8 @@ MUTATIONS = {
     "air that drives a contact": Mutation(
         "deep * change {- => +} air", f"{LASTING}test_air_takes_what_an_integrated_damped_contact_loses"
     ),
+    "straight paths through a bridge": Mutation("lasts * tau + flown{ + drawn => }", COURSE),
+    "air counted twice between solid and gap 0": Mutation("raised * {(u + w) => (w - u)}", COURSE),
     "lead that a push lengthens": Mutation(
         "longer {- => +} fraction", f"{LASTING}test_a_lead_is_covered_sooner_with_a_push"
     ),
