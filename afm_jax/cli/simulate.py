@@ -12,7 +12,7 @@ from afm_jax.cli.command import Output, later
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Orders, Positive, Share
-from afm_jax.motion.follow import LongRun, follow_long
+from afm_jax.motion.follow import follow_long
 from afm_jax.motion.motion_table import MotionTable
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
@@ -84,7 +84,16 @@ def simulation(  # noqa: PLR0913
     longest = duration_us if duration_us is not None else (periods or _MOST_PERIODS) * period_us
     _check_duration(scene.scene, longest)
     settings = {"accuracy": accuracy, "until_settled": until_settled}
-    run = _follow(session, scene, longest, settings)
+    start, parts = start_of(scene.scene, scene.start), "us at most" if until_settled else "us"
+    begin_us = float(start.time_us)
+    with session.working("simulating (the first run compiles for some seconds)", parts) as tell:
+
+        def report_time(time_us: float, _: Any) -> None:
+            tell(round(time_us - begin_us), round(longest))
+
+        run = follow_long(scene.scene, start, longest, report=report_time, **settings)
+    if int(run.simulation.outcome) == MotionOutcome.INVALID_START:
+        raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
     with session.working("reading amplitudes"):
         dense = DensePath(scene.scene, run.simulation)
         seen = observe(scene.scene, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
@@ -113,23 +122,6 @@ def _check_duration(scene: Scene, duration_us: float) -> None:
                 f"in {duration_us:.6g} us the {what} would oscillate {oscillations:.3g} times, more than the "
                 f"{MOST_OSCILLATIONS:g} that can be followed: give a shorter --duration-us or fewer --periods"
             )
-
-
-def _follow(session: Session, scene: NamedScene, longest_us: float, settings: dict[str, Any]) -> LongRun:
-    """Return the simulation; progress of long runs goes to standard error."""
-    start = start_of(scene.scene, scene.start)
-    begin_us, parts = float(start.time_us), "us at most" if settings["until_settled"] else "us"
-    with session.working("simulating (the first run compiles for some seconds)", parts) as tell:
-        run = follow_long(
-            scene.scene,
-            start,
-            longest_us,
-            report=lambda time_us, _: tell(round(time_us - begin_us), round(longest_us)),
-            **settings,
-        )
-    if int(run.simulation.outcome) == MotionOutcome.INVALID_START:
-        raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
-    return run
 
 
 def _write_trace(session: Session, dense: DensePath, window: Window) -> None:

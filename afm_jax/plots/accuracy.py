@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_panels
 
 _SMALLEST = 1e-17
 """Errors below this are 0 but for rounding; they are drawn here."""
@@ -20,8 +20,7 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
     Args:
         result: of `afm_jax.studies.accuracy.measured`.
     """
-    figure = new_figure(11.0, 5.0)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels(11.0, 5.0, 1, 2, sharey=True)
     for axes, kind, own in zip(
         panels, ("value", "gradient"), ("reference_error", "reference_gradient_error"), strict=True
     ):

@@ -1,5 +1,7 @@
 """Pictures of continuations: branches with their special points and bands, and curves in two parameters."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -9,7 +11,7 @@ from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.dynamics.special_points import OrbitBranch
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_panels
 from afm_jax.units import TWO_SIDED_95
 
 _MARKS = {
@@ -20,6 +22,7 @@ _MARKS = {
     "capture": ("v", DARK),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
+_HOLLOW: dict[str, Any] = {"ms": 8, "mfc": "none", "mew": 1.8, "capsize": 3, "zorder": 4}
 
 
 def continuation_figure(found: Continuation) -> Figure:
@@ -28,8 +31,7 @@ def continuation_figure(found: Continuation) -> Figure:
     Marks of special points are hollow: the branch goes on through them. Where the law has errors, 95 % of the
     amplitudes are within the ground that is coloured, and of the special points within the bars.
     """
-    figure = new_figure(7.0, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.0, 4.6)
     for number, branch in enumerate(found.branches):
         _draw_branch(axes, branch)
         if found.amplitude_errors is not None:
@@ -40,19 +42,8 @@ def continuation_figure(found: Continuation) -> Figure:
         half = None if found.special_errors is None else TWO_SIDED_95 * float(found.special_errors[index])
         marker, colour = _MARKS[point.kind]
         height = float(point.reading.peak_amplitude_nm)
-        axes.errorbar(
-            point.parameter,
-            height,
-            xerr=half,
-            fmt=marker,
-            color=colour,
-            markersize=8,
-            markerfacecolor="none",
-            markeredgewidth=1.8,
-            capsize=3,
-            zorder=4,
-            label=point.kind.replace("_", " "),
-        )
+        style = {"fmt": marker, "color": colour, "label": point.kind.replace("_", " ")}
+        axes.errorbar(point.parameter, height, xerr=half, **_HOLLOW, **style)
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.margins(x=0.02)
@@ -95,8 +86,7 @@ def curves_figure(found: Continuation) -> Figure:
     """
     if found.second is None:
         raise ValueError("there are no curves: no second parameter was followed")
-    figure = new_figure(7.0, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.0, 4.6)
     for curve in found.curves:
         _, colour = _MARKS[curve.kind]
         for flown, line in ((True, "-"), (False, ":")):

@@ -21,7 +21,7 @@ from afm_jax.plots.picture_style import (
     DARK,
     GRID,
     label_axes,
-    new_figure,
+    new_panels,
     save,
 )
 
@@ -205,11 +205,10 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
 def course_figure(look: Look) -> Figure:
     """Return the time course, of many contacts with the peaks of the whole motion below."""
     overview = len(look.dense.contacts.kind) >= _MANY
-    picture = new_figure(9.0, 7.0 if overview else 4.6)
-    axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
-    _course(axes[0], look)
+    picture, axes = new_panels(9.0, 7.0 if overview else 4.6, 1 + overview, squeeze=False)
+    _course(axes[0, 0], look)
     if overview:
-        _peaks(axes[1], look)
+        _peaks(axes[1, 0], look)
     return picture
 
 
@@ -262,8 +261,7 @@ def _around(look: Look, row: int) -> tuple[float, float]:
 
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
-    picture = new_figure(12.0, 5.0)
-    whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
+    picture, (whole, part) = new_panels(12.0, 5.0, 1, 2, width_ratios=[1.0, 1.5])
     rows = np.arange(len(look.dense.contacts.kind))[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
@@ -295,14 +293,12 @@ _LEAST_SHOWN = 0.02
 def section_figure(look: Look) -> Figure:
     """Return the Poincaré section, the order in time as a shade."""
     phase, rows = poincare_section(look.scene, look.dense.simulation)
-    picture = new_figure(7.5, 5.4)
-    axes = picture.subplots()
+    picture, axes = new_panels(7.5, 5.4)
     velocity = rows.departure_velocity_nm_per_us
     size = 30 if phase.size < 100 else 8
     axes.plot(phase[-1], velocity[-1], "o", color="black", markersize=11, fillstyle="none", label="the last one")
     shades = axes.scatter(phase, velocity, c=np.arange(1, phase.size + 1), s=size, cmap="viridis_r", zorder=3)
-    bar = picture.colorbar(shades, ax=axes)
-    bar.set_label("contact", fontsize=11)
+    picture.colorbar(shades, ax=axes, label="contact")
     label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
     axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
     # what is left of a settled motion is rounding: the axis does not magnify it
@@ -314,15 +310,10 @@ def section_figure(look: Look) -> Figure:
     return picture
 
 
-class Spectrum(NamedTuple):
-    """Amplitudes of the waves that a deflection is made of."""
+def spectrum_of(look: Look) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Return frequencies in kHz and amplitudes in nm of the waves that the deflection is made of.
 
-    frequency_khz: Float[np.ndarray, " lines"]
-    amplitude_nm: Float[np.ndarray, " lines"]
-
-
-def spectrum_of(look: Look) -> Spectrum:
-    """Return the spectrum over the last whole response periods, from equally spaced samples.
+    They are those of the last whole response periods, from equally spaced samples.
 
     The samples end with the last whole response period, so that a motion that repeats has lines without skirts; one
     that does not is weighted with a Hann window.
@@ -342,19 +333,18 @@ def spectrum_of(look: Look) -> Spectrum:
     mean = float(np.sum(weight * deflection) / weight.sum())
     amplitude = 2.0 * np.abs(np.fft.rfft((deflection - mean) * weight)) / weight.sum()
     amplitude[0] = abs(mean)
-    return Spectrum(1e3 * np.fft.rfftfreq(samples, step), amplitude)
+    return 1e3 * np.fft.rfftfreq(samples, step), amplitude
 
 
 def spectrum_figure(look: Look) -> Figure:
     """Return the spectrum, with the drive, a second tone, the response and the free vibration marked."""
-    found, repeats = spectrum_of(look), look.responses.repeats
-    picture = new_figure(9.0, 5.0)
-    axes = picture.subplots()
+    (frequency, amplitude), repeats = spectrum_of(look), look.responses.repeats
+    picture, axes = new_panels(9.0, 5.0)
     drive, response = 1e3 / look.drive.period_us, 1e3 / look.responses.response_us
     free, tones = float(look.scene.cantilever.frequency_khz), _further_tones_khz(look.scene, drive)
     right = max(_HIGHEST * min(response, 2.0 * free), 2.2 * drive, *(1.1 * tone for tone in tones))
-    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= right)
-    frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
+    shown = (frequency > 0.0) & (frequency <= right)
+    frequency, amplitude = frequency[shown], amplitude[shown]
     floor, top = max(float(amplitude.max()) * _DECADES, 1e-12), float(amplitude.max()) * 30.0
     if repeats:
         axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)
