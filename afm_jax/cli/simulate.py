@@ -138,11 +138,10 @@ def _write_trace(session: Session, dense: DensePath, window: Window) -> None:
     begin = window.to_us - responses * response
     count = math.ceil(responses * window.periods * _SAMPLES_A_PERIOD)
     times = np.linspace(begin, window.to_us, count, endpoint=False)
-    deflection = dense.at(times).position_nm
-    columns = {"time_us": times, "deflection_nm": deflection}
+    columns = {"time_us": times, "deflection_nm": dense.at(times).position_nm}
     if scene.base is not None:
         columns["drive"] = np.asarray(scene.base.position_and_velocity(times)[0])
-        columns["deflection_nm"] = deflection - columns["drive"]
+        columns["deflection_nm"] = columns["deflection_nm"] - columns["drive"]
     elif scene.force is not None:
         columns["drive"] = np.asarray(scene.force.force(times))
     else:

@@ -21,16 +21,13 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
         result: of `afm_jax.studies.accuracy.measured`.
     """
     figure, panels = new_panels(11.0, 5.0, 1, 2, sharey=True)
+    known = [row for row in result["rows"] if row["error"] is not None and row["error"] < 1.0]
     for axes, kind, own in zip(
         panels, ("value", "gradient"), ("reference_error", "reference_gradient_error"), strict=True
     ):
         for method, (colour, marker, line) in _STYLES.items():
-            chosen = [row for row in result["rows"] if (row["of"], row["method"]) == (kind, method)]
-            places = [
-                (max(row["error"], _SMALLEST), row["microseconds"])
-                for row in chosen
-                if row["error"] is not None and row["error"] < 1.0
-            ]
+            chosen = [row for row in known if (row["of"], row["method"]) == (kind, method)]
+            places = [(max(row["error"], _SMALLEST), row["microseconds"]) for row in chosen]
             if places:
                 axes.plot(*zip(*sorted(places), strict=True), color=colour, marker=marker, ls=line, label=method)
         if result[own] > _SMALLEST:

@@ -68,8 +68,7 @@ def _draw_branch(axes: Axes, branch: OrbitBranch) -> None:
 
 def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
     """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
-    height = branch.reading.peak_amplitude_nm
-    half = TWO_SIDED_95 * error
+    height, half = branch.reading.peak_amplitude_nm, TWO_SIDED_95 * error
     shown = np.isfinite(half) & (half < 0.3 * np.abs(height)) & branch.reading.admissible
     low, high = height - half, height + half
     axes.fill_between(branch.parameter, low, high, where=shown, color=BLUE, alpha=0.2, linewidth=0.0)
@@ -99,8 +98,7 @@ def curves_figure(found: Continuation) -> Figure:
                 name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
                 axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=name)
         for one in curve.meetings:
-            marker = "*" if one.kind == "cusp" else "X"
-            name = "cusp" if one.kind == "cusp" else "codimension two"
+            marker, name = ("*", "cusp") if one.kind == "cusp" else ("X", "codimension two")
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
