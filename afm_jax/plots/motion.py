@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import ContactPhase, find_junction
-from afm_jax.motion.observe import peaks_between_contacts, poincare_section
+from afm_jax.motion.observe import poincare_section
 from afm_jax.motion.record import Simulation, contacts_of
 from afm_jax.motion.settle import Settled, is_stuck, settled, slower_period_us, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory
@@ -33,8 +33,6 @@ _BESIDE_US = 1e-7
 """How far before and after a jump its two sides are looked at."""
 _LONGEST_HELD = 4.0
 """Drive periods of a held tip that are shown: it is integrated step by step."""
-_MANY = 12
-"""Contacts from which on the peaks of all flights are shown besides."""
 _CURVES = 3
 _GAP_SHOWN_NM = 6.0
 _STROKES = ((GRID, 5.0), ("#56B4E9", 3.2), ("black", 1.4))
@@ -203,16 +201,8 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
 
 
 def course_figure(look: Look) -> Figure:
-    """Return the time course, of many contacts with the peaks of the whole motion below."""
-    overview = len(look.dense.contacts.kind) >= _MANY
-    picture, axes = new_panels(9.0, 7.0 if overview else 4.6, 1 + overview, squeeze=False)
-    _course(axes[0, 0], look)
-    if overview:
-        _peaks(axes[1, 0], look)
-    return picture
-
-
-def _course(axes: Axes, look: Look) -> None:
+    """Return the time course of the tip and of what drives it, with its contacts shaded."""
+    picture, axes = new_panels(9.0, 4.6)
     time = look.path.time_us
     axes.plot(time, look.path.position_nm, color="black", linewidth=1.6, label="tip")
     if look.scene.interaction is not None:
@@ -224,30 +214,17 @@ def _course(axes: Axes, look: Look) -> None:
     shade_phases(axes, look.path, look.scene.interaction)
     axes.axhline(0.0, color=GRID, linewidth=0.8)
     axes.set_xlim(look.from_us, look.to_us)
-    _with_legend_above(axes, x="time (µs)", y="height (nm)")
+    # room for the legend above the curves
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
+    label_axes(axes, x="time (µs)", y="height (nm)")
+    axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
     count = len(look.dense.contacts.kind)
     what = f"The last contacts of {count}" if count else "Last periods"
     if is_stuck(look.scene, look.dense.simulation):
         what += ", the sample holds the tip"
     axes.set_title(what, fontsize=12, loc="left")
-
-
-def _with_legend_above(axes: Axes, *, x: str, y: str) -> None:
-    """Label the axes, and put a legend into room above the curves."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.22 * (high - low))
-    label_axes(axes, x=x, y=y)
-    axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
-
-
-def _peaks(axes: Axes, look: Look) -> None:
-    """Draw the peak after each contact over the whole motion, and mark the stretch above."""
-    peaks = peaks_between_contacts(look.scene, look.dense.simulation)
-    axes.plot(look.dense.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
-    axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
-    axes.axhline(0.0, color=GRID, linewidth=0.8)
-    what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
-    _with_legend_above(axes, x="time (µs)", y=f"peak after each {what} (nm)")
+    return picture
 
 
 def _around(look: Look, row: int) -> tuple[float, float]:
