@@ -7,6 +7,7 @@ outside the folder is overwritten. Only a path that the user named as the one to
 """
 
 import errno
+import io
 import os
 import secrets
 import shutil
@@ -28,11 +29,16 @@ def read_whole(path: str | os.PathLike[str]) -> bytes:
     Raises:
         OSError: if it cannot be read, or holds too much.
     """
-    with Path(path).open("rb") as file:
-        whole = file.read(LARGEST_BYTES + 1)
+    whole = bytearray()
+    with io.FileIO(path) as file:
+        while len(whole) <= LARGEST_BYTES and (part := file.read(min(_PART, LARGEST_BYTES + 1 - len(whole)))):
+            whole += part
     if len(whole) > LARGEST_BYTES:
         raise OSError(errno.EFBIG, f"it holds more than {LARGEST_BYTES:,} bytes", os.fspath(path))
-    return whole
+    return bytes(whole)
+
+
+_PART = 1 << 20
 
 
 def first_bytes(path: str | os.PathLike[str], count: int) -> bytes:
