@@ -221,15 +221,11 @@ def _misfit(kind: Any, value: Any) -> str:
 
 def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noqa: PLR0911
     """Return what a value must be that is not of a class, with what stands in its brackets; nothing where it is."""
-    if kind is type(None):
-        return "" if value is None else "None"
     simple = _SIMPLE.get(kind)
     if simple is not None:
         return "" if simple[1](value) else simple[0]
     if kind is Literal:
         return "" if value in parts else f"one of {', '.join(map(repr, parts))}"
-    if kind is Callable or kind is collections.abc.Callable:
-        return "" if callable(value) else "a function"
     if hasattr(kind, "array_type"):
         return "" if is_array(value) or _is_real(value) else "an array of real numbers"
     if kind in (list, tuple, collections.abc.Sequence):
@@ -291,6 +287,8 @@ _SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     int: ("a whole number", _is_whole),
     float: ("a real number", _is_number),
     bool: ("True or False", lambda value: isinstance(value, bool | np.bool_)),
+    type(None): ("None", lambda value: value is None),
+    Callable: ("a function", callable),
     str: ("a text", lambda value: isinstance(value, str)),
     os.PathLike: ("a path", lambda value: isinstance(value, os.PathLike)),
     Path: ("a path", lambda value: isinstance(value, os.PathLike)),

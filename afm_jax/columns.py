@@ -24,9 +24,7 @@ def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def csv_cells(column: Any) -> Iterable[Any]:
     """Return the cells of a column: numbers with all their digits, true and false in words, the unknown empty."""
-    if hasattr(column, "tolist"):
-        return map(_csv_cell, column.tolist())
-    return (_csv_cell(_plain(value)) for value in column)
+    return (_csv_cell(_plain(value)) for value in _plain(column))
 
 
 def _csv_cell(value: Any) -> Any:

@@ -181,10 +181,9 @@ def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
     text = io.StringIO()
     console = Console(file=text, width=_UNBROKEN)
     for part in parts:
-        if isinstance(part, str):
-            console.print(part, markup=False, highlight=False, soft_wrap=True)
-        elif part is not None:
-            console.print(part)
+        if part is not None:
+            is_text = isinstance(part, str)
+            console.print(part, markup=not is_text, highlight=not is_text, soft_wrap=is_text)
     return text.getvalue().rstrip("\n")
 
 

@@ -53,18 +53,14 @@ def why_no_fit(contents: Any) -> str | None:
 
 def fields_of(record: Any) -> Iterator[tuple[str, Any]]:
     """Give names and values of a record: a named tuple, a dataclass or a module of equinox."""
-    names = record._fields if is_tuple(record) else [field.name for field in dataclasses.fields(record)]
+    names = getattr(record, "_fields", ()) or [field.name for field in dataclasses.fields(record)]
     return ((name, getattr(record, name)) for name in names)
-
-
-def is_tuple(value: Any) -> bool:
-    """Say whether a value is a named tuple."""
-    return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
 def is_record(value: Any) -> bool:
     """Say whether a value has named fields."""
-    return is_tuple(value) or (dataclasses.is_dataclass(value) and not isinstance(value, type))
+    named_tuple = isinstance(value, tuple) and hasattr(value, "_fields")
+    return named_tuple or (dataclasses.is_dataclass(value) and not isinstance(value, type))
 
 
 def is_abstract(value: Any) -> bool:

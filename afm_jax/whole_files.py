@@ -63,11 +63,9 @@ def check_plain(path: str | os.PathLike[str]) -> None:
         mode = Path(path).lstat().st_mode
     except FileNotFoundError:
         return
-    if stat.S_ISLNK(mode):
-        raise OSError(errno.ELOOP, "is a link, which is not followed; delete it or choose another folder", str(path))
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        what = "is a device or a pipe, not a file; delete it or choose another folder"
-        raise OSError(errno.EINVAL, what, str(path))
+        what = "a link, which is not followed" if stat.S_ISLNK(mode) else "a device or a pipe, not a file"
+        raise OSError(errno.EINVAL, f"is {what}; delete it or choose another folder", str(path))
 
 
 @contextmanager

@@ -203,8 +203,6 @@ def shown(text: str) -> str:
     >>> print(shown("a\x1b[31m.csv"))
     a\x1b[31m.csv
     """
-    if text.isprintable():
-        return text
     return "".join(sign if sign.isprintable() or sign in "\n\t" else repr(sign)[1:-1] for sign in text)
 
 

@@ -1,7 +1,6 @@
 """`afm-jax accuracy`: error against time, of a value and of its gradient."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from click import IntRange
 
@@ -43,26 +42,20 @@ def accuracy(
         load_named(study)
     with session.working("measuring"):
         result = timing.run_in_own_process(measured, problem=study, contacts=contacts, quick=quick)
-    rows = result["rows"]
+    rows, title = result["rows"], f"Error of the {result['value_of']} and of its gradient against time"
+    reference = (
+        f"Reference: {result['reference']}, itself known to {result['reference_error']:.0e} (gradient: "
+        f"{result['reference_gradient_error']:.0e}). Times are those of one impact or contact on one core, programs "
+        "compiled. A gradient is that by all parameters of the problem, relative to its largest value among the tips."
+    )
     return Output(
         payload={"problem": study, **result},
         text=[
-            printed_table(
-                f"Error of the {result['value_of']} and of its gradient against time", _CELLS, rows, form=".3g"
-            ),
+            printed_table(title, _CELLS, rows, form=".3g"),
             *dict.fromkeys(f"{row['method']}, {row['setting']}: {row['reason']}" for row in rows if "reason" in row),
-            reference_sentence(result),
+            reference,
         ],
         tables={"accuracy.csv": columns_of(rows, _COLUMNS)},
         files={"accuracy.png": picture_of("accuracy:accuracy_figure", result)},
         json_file="accuracy.json",
-    )
-
-
-def reference_sentence(result: Mapping[str, Any]) -> str:
-    """Say what the errors are measured against, how good that is, and what the times are of."""
-    return (
-        f"Reference: {result['reference']}, itself known to {result['reference_error']:.0e} (gradient: "
-        f"{result['reference_gradient_error']:.0e}). Times are those of one impact or contact on one core, programs "
-        "compiled. A gradient is that by all parameters of the problem, relative to its largest value among the tips."
     )

@@ -52,14 +52,9 @@ def bifurcation(  # noqa: PLR0913
             sweeps.append(bifurcation_diagram(drawn, swept.path, swept.values, upward=upward, report=report, **how))
     if scene.unknowns is not None:
         with session.working("sweeping with drawn laws"):
-            sweeps = [
-                sweep._replace(
-                    verdict_probability=verdict_probability(
-                        scene.scene, swept.path, sweep, scene.unknowns, draws=draws, **how
-                    )
-                )
-                for sweep in sweeps
-            ]
+            for number, sweep in enumerate(sweeps):
+                share = verdict_probability(scene.scene, swept.path, sweep, scene.unknowns, draws=draws, **how)
+                sweeps[number] = sweep._replace(verdict_probability=share)
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)

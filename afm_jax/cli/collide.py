@@ -1,6 +1,7 @@
 """`afm-jax collide [SCENE.toml] --speeds 12,15,20`: free tips through the contact."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import click
@@ -62,10 +63,7 @@ def collide(
             laws,
             payload=laws.to_dict() | told,
             text=text,
-            files={
-                "law.json": lambda path: save_law(laws.law, path),
-                "law.csv": lambda path: save_law_csv(laws.law, path),
-            },
+            files={"law.json": partial(save_law, laws.law), "law.csv": partial(save_law_csv, laws.law)},
             json_file="collide.json",
         )
     with session.working("colliding (the first run compiles for some seconds)"):

@@ -88,11 +88,14 @@ class Output:
 
 
 def later(function: str) -> Callable[..., Any]:
-    """Return a function, "module:function", whose module is imported when it is called: pictures need matplotlib."""
+    """Return a function, "module:function", whose module is imported when it is called: pictures need matplotlib.
+
+    A module that begins with a point is of this folder.
+    """
     module, _, name = function.partition(":")
 
     def call(*arguments: Any, **options: Any) -> Any:
-        return getattr(import_module(module), name)(*arguments, **options)
+        return getattr(import_module(module, __package__), name)(*arguments, **options)
 
     return call
 
@@ -230,10 +233,8 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
             session.start_computing()
         has_scene = SCENE in described(row.runs)[1]
         if has_scene:
-            load_named = import_module("afm_jax.cli.scenes").load_named
-            options["scene"] = load_named(options["scene"], options.pop("law", None))
-        module, _, name = row.runs.partition(":")
-        output = getattr(import_module(module, __package__), name)(session, **options)
+            options["scene"] = later(".scenes:load_named")(options["scene"], options.pop("law", None))
+        output = later(row.runs)(session, **options)
         if output is not None:
             hand_out(session, _with_scene(output, options) if has_scene else output)
 
@@ -263,12 +264,12 @@ def hand_out(session: Session, output: Output) -> None:
 def _with_scene(output: Output, options: Mapping[str, Any]) -> Output:
     """Return a result that names its scene, and where its law is extrapolated."""
     scene = options["scene"]
-    scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
-    payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
+    tables, text = later("afm_jax.scenefile.scenefile:scene_tables")(scene.scene), list(output.text)
+    payload = {**output.payload, "scene": tables}
     if scene.unknowns is not None and "draws" in options:
         payload["draws"] = options["draws"]
     if output.impact_speeds is not None:
-        extrapolation_of = import_module("afm_jax.impact.law").extrapolation_of
+        extrapolation_of = later("afm_jax.impact.law:extrapolation_of")
         payload["extrapolated"] = extrapolation_of(scene.scene.interaction, output.impact_speeds)
         text.append(payload["extrapolated"])
     return replace(output, payload=payload, text=text)

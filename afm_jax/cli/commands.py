@@ -1,7 +1,5 @@
 """The commands, a row each; what they do stands in the functions that they name, with their help and their options."""
 
-import math
-
 import click
 
 from afm_jax.cli.command import Command
@@ -32,7 +30,7 @@ _PRIOR_OPTIONS = (
     *(
         click.Option(
             [option_of(each.name)],
-            type=ValueAndError(**{"none": (math.inf, None)} if each.name == "quality_factor" else {}),
+            type=ValueAndError(**{"none": (None, None)} if each.name == "quality_factor" else {}),
             help=f"{each.meaning}, 'VALUE +- ERROR'.",
         )
         for each in PRIOR_NUISANCES

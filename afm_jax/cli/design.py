@@ -1,6 +1,5 @@
 """`afm-jax design`: which drives to measure next, and what they will determine."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -107,11 +106,10 @@ def prior_of(path: Path | None, model: str | None, uncertainty: float, given: Ma
     for name, (_, error) in instrument.items():
         if name not in {"quality_factor", "free_frequency_khz"} and error is None:
             raise click.UsageError(f"{option_of(name)} needs its standard error; write 'VALUE +- ERROR'")
-    quality_factor, _ = given.get("quality_factor", (math.inf, None))
     return prior_of_values(
         model or "law+delay",
         free_frequency_khz=given["free_frequency_khz"][0],
-        quality_factor=None if quality_factor == math.inf else quality_factor,
+        quality_factor=given.get("quality_factor", (None, None))[0],
         mass_ng=given.get("mass_ng"),
         values={name: given[name] for name in LAW_NAMES if name in given},
         constraints={name: both for name, both in instrument.items() if both[1] is not None},

@@ -42,18 +42,12 @@ def doctor(session: Session) -> Output:
         "processors": os.cpu_count(),
         "devices": [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()],
         "float_bits": jax.numpy.zeros(()).dtype.itemsize * 8,
-        "cache": {
-            "folder": None if cache.folder is None else str(cache.folder),
-            "reason": cache.reason,
-            "works": works,
-        },
+        "cache": {"folder": cache.folder, "reason": cache.reason, "works": works},
     }
     complaints = [] if excluded is None else [excluded]
-    if cache.refused:
-        complaints.append(f"the compilation cache does not work: {cache.reason}")
-    elif cache.folder is not None and not works:
-        fault = "a program that one process compiled was not found by the next"
-        complaints.append(f"the compilation cache does not work: {cache.folder}: {fault}")
+    if cache.refused or (cache.folder is not None and not works):
+        lost = f"{cache.folder}: a program that one process compiled was not found by the next"
+        complaints.append(f"the compilation cache does not work: {cache.reason if cache.refused else lost}")
     return Output(payload=payload, text=_lines(payload), not_valid="; ".join(complaints) or None)
 
 

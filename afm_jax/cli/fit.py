@@ -11,7 +11,7 @@ from click import IntRange
 
 from afm_jax.cli.command import Output, hand_out
 from afm_jax.cli.session import Session
-from afm_jax.cli.tables import example_path, tables_with
+from afm_jax.cli.tables import example_path
 from afm_jax.cli.values import Constraint, Fixed, ModelName, Names, QualityFactor, Share
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from fitting.infer.comparison import compare as compared_models
@@ -23,6 +23,7 @@ from fitting.report.report import summary, write_report
 from fitting.sampling.posterior import posterior as sampled_posterior
 from fitting.sampling.posterior import require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
+from fitting.tables.table import as_table
 
 
 def fit(  # noqa: PLR0913
@@ -94,7 +95,7 @@ def fit(  # noqa: PLR0913
         settings |= parameters_of_contact(free, settings["fixed"], no or ())
     if posterior and not sampled_by_gaussian(model):
         require_blackjax()
-    read = tables_with(tables or (example_path(),), noise, quality_factor)
+    read = [as_table(path, noise=noise, quality_factor=quality_factor) for path in tables or (example_path(),)]
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for ten seconds" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")

@@ -5,9 +5,10 @@ from typing import Annotated
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.cli.tables import example_path, tables_with
+from afm_jax.cli.tables import example_path
 from afm_jax.cli.values import QualityFactor, Share
 from fitting.inversion.invert import invert
+from fitting.tables.table import as_table
 
 
 def inversion(
@@ -32,7 +33,7 @@ def inversion(
         quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
         example: invert the bundled table instead of a file.
     """
-    (measured,) = tables_with([table or example_path()], noise, quality_factor)
+    measured = as_table(table or example_path(), noise=noise, quality_factor=quality_factor)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured)
     return Output.of(result, "invert")

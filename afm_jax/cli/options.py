@@ -66,10 +66,8 @@ def _arguments(node: Any) -> Iterator[tuple[str, Any, ast.expr | None, bool]]:
         return
     bare, named = node.args.args[1:], node.args.kwonlyargs
     defaults = [None] * (len(bare) - len(node.args.defaults)) + node.args.defaults[-len(bare) :] if bare else []
-    yield from ((each.arg, each.annotation, value, True) for each, value in zip(bare, defaults, strict=True))
-    yield from (
-        (each.arg, each.annotation, value, False) for each, value in zip(named, node.args.kw_defaults, strict=True)
-    )
+    for each, value in zip((*bare, *named), (*defaults, *node.args.kw_defaults), strict=True):
+        yield each.arg, each.annotation, value, each in bare
 
 
 def _parameter(name: str, annotation: ast.expr, value: ast.expr | None, bare: bool, meaning: str) -> click.Parameter:  # noqa: FBT001
@@ -91,11 +89,8 @@ def _parameter(name: str, annotation: ast.expr, value: ast.expr | None, bare: bo
         return click.Option([name, *spelled, option_of(name)], is_flag=True, help=meaning)
     if several or default is not None:
         # of several values help says it in words
-        more |= {
-            "default": default,
-            "multiple": several,
-            "show_default": default != "" and not isinstance(default, tuple),
-        }
+        in_help = default != "" and not isinstance(default, tuple)
+        more |= {"default": default, "multiple": several, "show_default": in_help}
     return click.Option([name, *spelled, option_of(name)], required=value is None, help=meaning, **more)
 
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from click import IntRange
 
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import NamedScene, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
@@ -12,8 +12,6 @@ from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.impact_orbits import many_impact_orbits
 from afm_jax.dynamics.orbit_tables import OrbitTable
 from afm_jax.impact.orbits import single_impact_orbits
-
-save = later("afm_jax.plots.picture_style:save")
 
 
 def orbits(
@@ -47,11 +45,10 @@ def orbits(
             of_scene = single_impact_orbits(scene.scene, order)
         if not bool(of_scene.complete):
             session.note("there are more orbits than could be listed; the slowest are shown")
-        told = OrbitTable(scene.scene, order, of_scene)
     else:
         impacts = impacts or 1
         with session.working("searching for orbits (the first run compiles for some seconds)"):
             search = contact_orbits if resolved else many_impact_orbits
             of_scene = search(scene.scene, order, impacts)
-        told = OrbitTable(scene.scene, order, of_scene, impacts)
-    return Output.of(told, files={"orbits.png": lambda path: save(told.plot(), path)})
+    files = {"orbits.png": picture_of("dynamics:orbits_figure", of_scene)}
+    return Output.of(OrbitTable(scene.scene, order, of_scene, impacts), files=files)

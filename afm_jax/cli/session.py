@@ -176,11 +176,9 @@ class Session:
                 if part is None:
                     continue
                 words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
-                if isinstance(words, str):
+                if is_text := isinstance(words, str):
                     words = _broken(shown(in_callers_words(words)), console.width)
-                    console.print(words, markup=False, highlight=False, soft_wrap=True)
-                else:
-                    console.print(words)
+                console.print(words, markup=not is_text, highlight=not is_text, soft_wrap=is_text)
         sys.stdout.flush()
 
     def write_table(self, name: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from afm_jax.cli.command import Output, later
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Orders, Positive, Share
-from afm_jax.motion.follow import LongRun, follow_long
+from afm_jax.motion.follow import follow_long
 from afm_jax.motion.motion_table import MotionTable
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
@@ -84,7 +84,16 @@ def simulation(  # noqa: PLR0913
     longest = duration_us if duration_us is not None else (periods or _MOST_PERIODS) * period_us
     _check_duration(scene.scene, longest)
     settings = {"accuracy": accuracy, "until_settled": until_settled}
-    run = _follow(session, scene, longest, settings)
+    start, parts = start_of(scene.scene, scene.start), "us at most" if until_settled else "us"
+    begin_us = float(start.time_us)
+    with session.working("simulating (the first run compiles for some seconds)", parts) as tell:
+
+        def report_time(time_us: float, _: Any) -> None:
+            tell(round(time_us - begin_us), round(longest))
+
+        run = follow_long(scene.scene, start, longest, report=report_time, **settings)
+    if int(run.simulation.outcome) == MotionOutcome.INVALID_START:
+        raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
     with session.working("reading amplitudes"):
         dense = DensePath(scene.scene, run.simulation)
         seen = observe(scene.scene, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
@@ -115,23 +124,6 @@ def _check_duration(scene: Scene, duration_us: float) -> None:
             )
 
 
-def _follow(session: Session, scene: NamedScene, longest_us: float, settings: dict[str, Any]) -> LongRun:
-    """Return the simulation; progress of long runs goes to standard error."""
-    start = start_of(scene.scene, scene.start)
-    begin_us, parts = float(start.time_us), "us at most" if settings["until_settled"] else "us"
-    with session.working("simulating (the first run compiles for some seconds)", parts) as tell:
-        run = follow_long(
-            scene.scene,
-            start,
-            longest_us,
-            report=lambda time_us, _: tell(round(time_us - begin_us), round(longest_us)),
-            **settings,
-        )
-    if int(run.simulation.outcome) == MotionOutcome.INVALID_START:
-        raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
-    return run
-
-
 def _write_trace(session: Session, dense: DensePath, window: Window) -> None:
     """Write trace.csv, the deflection over the last response periods at equal steps of time, into the `--out` folder.
 
@@ -146,11 +138,10 @@ def _write_trace(session: Session, dense: DensePath, window: Window) -> None:
     begin = window.to_us - responses * response
     count = math.ceil(responses * window.periods * _SAMPLES_A_PERIOD)
     times = np.linspace(begin, window.to_us, count, endpoint=False)
-    deflection = dense.at(times).position_nm
-    columns = {"time_us": times, "deflection_nm": deflection}
+    columns = {"time_us": times, "deflection_nm": dense.at(times).position_nm}
     if scene.base is not None:
         columns["drive"] = np.asarray(scene.base.position_and_velocity(times)[0])
-        columns["deflection_nm"] = deflection - columns["drive"]
+        columns["deflection_nm"] = columns["deflection_nm"] - columns["drive"]
     elif scene.force is not None:
         columns["drive"] = np.asarray(scene.force.force(times))
     else:

@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -77,13 +76,13 @@ def sweep(
         run = run_plan(plan, session.out, workers=workers, scheduler=scheduler, report=report)
     store, points, chunks = session.out / STORE, math.prod(plan.shape), run.kept + run.computed
     messages, beyond = Counter[str](), None
-    with xarray.open_zarr(str(store)) as found:
-        if MESSAGE in found:
-            messages.update(text for text in found[MESSAGE].values.ravel().tolist() if text)
-        if EXTRAPOLATED in found:
-            outside = int(found[EXTRAPOLATED].values.reshape(points, -1).any(axis=1).sum())
-            where = f"at {outside} of {points} points impacts come outside the speeds that the law is known for"
-            beyond = f"Extrapolated: {where}." if outside else None
+    found = xarray.open_zarr(str(store))
+    if MESSAGE in found:
+        messages.update(text for text in found[MESSAGE].values.ravel().tolist() if text)
+    if EXTRAPOLATED in found:
+        outside = int(found[EXTRAPOLATED].values.reshape(points, -1).any(axis=1).sum())
+        where = f"at {outside} of {points} points impacts come outside the speeds that the law is known for"
+        beyond = f"Extrapolated: {where}." if outside else None
     grid = f"{' x '.join(map(str, plan.shape))} points in {counted(chunks, 'chunk')}"
     lines = [f"{grid}. Computed in {run.seconds:.1f} s: {run.computed}; done before and kept: {run.kept}."]
     if messages:
@@ -104,13 +103,8 @@ def sweep(
     return Output(
         payload=payload,
         text=[*lines, f"Open them with xarray.open_zarr({str(store)!r}).", beyond],
-        files={"sweep.png": partial(_draw, plan, store)} if plot else {},
+        files={"sweep.png": picture_of("sweeps:sweep_figure", found, plan.recorder.shown)} if plot else {},
     )
-
-
-def _draw(plan: SweepPlan, store: Path, target: Path) -> None:
-    with xarray.open_zarr(str(store)) as found:
-        picture_of("sweeps:sweep_figure", found, plan.recorder.shown)(target)
 
 
 def _plan(given: dict[str, Any], folder: Path, law: Path | None) -> SweepPlan:

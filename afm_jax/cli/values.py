@@ -5,6 +5,7 @@ A kind makes a value of a text, and says in a sentence what is wrong with the te
 
 import math
 import re
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 import click
@@ -217,13 +218,11 @@ class Fixed(ValueKind):
     def read(self, text: str) -> tuple[str, Any]:
         """Return the name before an equals sign, and the number after it, or the numbers around +-."""
         name, _, numbers = text.partition("=")
-        try:
+        with suppress(ValueError):
             value, error = value_and_error(numbers)
-        except ValueError as fault:
-            raise ValueError(f"must be {self.form}, but is {text}") from fault
-        if not name.strip() or (error is not None) != self.has_error:
-            raise ValueError(f"must be {self.form}, but is {text}")
-        return name.strip().replace("-", "_"), (value, error) if self.has_error else value
+            if name.strip() and (error is not None) == self.has_error:
+                return name.strip().replace("-", "_"), (value, error) if self.has_error else value
+        raise ValueError(f"must be {self.form}, but is {text}")
 
 
 class Constraint(Fixed):
@@ -271,5 +270,5 @@ Positive = Annotated[float, Finite(positive=True)]
 CurveNumber = Annotated[int, click.IntRange(1)]
 ModelName = Annotated[str, click.Choice(MODELS)]
 Quantity = Annotated[tuple[float, float | None], ValueAndError()]
-QualityFactor = Annotated[tuple[float, float | None], ValueAndError(none=(math.inf, None))]
+QualityFactor = Annotated[tuple[float, float | None] | Literal["none"], ValueAndError(none="none")]
 Sensitivity = Annotated[tuple[float, float | None] | Literal["slope"], ValueAndError(slope="slope"), "NM|slope"]

@@ -14,30 +14,25 @@ the last response period once a motion has settled, else the whole response peri
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Bool, Float
 
-from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
-from afm_jax.impact.orbits import FlightEnds, highest_of_flight
 from afm_jax.motion.record import (
     ContactKind,
     Simulation,
     State,
     contacts_left,
-    contacts_of,
     to_gap,
-    with_response,
 )
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, fly
@@ -509,36 +504,6 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
     times = departure[early] + half * (_NODES + 1.0)
     gaps, _ = fly(cantilever, surface, *to_gap(surface, response, start), start.time_us, times)
     return complex(total + np.sum(half * _WEIGHTS * np.asarray(gaps) * np.exp(-1j * angular_frequency * times)))
-
-
-def peaks_of_flights(scene: Scene, start: State, end_us: ArrayLike) -> Float[np.ndarray, " flights"]:
-    """Return the largest height of each of some flights (`highest_of_flight`).
-
-    Args:
-        scene: the scene.
-        start: where the flights start in the lab, arrays of shape (flights,).
-        end_us: where they end.
-    """
-    start, end = jax.tree.map(partial(jnp.asarray, dtype=float), (start, end_us))
-    return np.asarray(_peaks(scene.cantilever, surface_of(scene)[1], start, end))
-
-
-@jax.jit
-def _peaks(
-    cantilever: Cantilever, response: Surface | None, start: State, end_us: Float[Array, " flights"]
-) -> Float[Array, " flights"]:
-    duration = end_us - start.time_us
-    _, position, velocity = with_response(response, start, -1.0)
-    ends = cantilever.propagator(duration)(position, velocity)
-    flights = FlightEnds(start.time_us, duration, position, velocity, *ends)
-    return jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response))(flights)
-
-
-def peaks_between_contacts(scene: Scene, simulation: Simulation) -> Float[np.ndarray, " flights"]:
-    """Return the largest heights of the flights from a contact to the next one, in order."""
-    rows = contacts_of(simulation)
-    starts = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
-    return peaks_of_flights(scene, State(*(column[:-1] for column in starts)), rows.arrival_time_us[1:])
 
 
 def poincare_section(scene: Scene, simulation: Simulation) -> tuple[Float[np.ndarray, " contacts"], Any]:

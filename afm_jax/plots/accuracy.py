@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_panels
 
 _SMALLEST = 1e-17
 """Errors below this are 0 but for rounding; they are drawn here."""
@@ -20,18 +20,14 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
     Args:
         result: of `afm_jax.studies.accuracy.measured`.
     """
-    figure = new_figure(11.0, 5.0)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels(11.0, 5.0, 1, 2, sharey=True)
+    known = [row for row in result["rows"] if row["error"] is not None and row["error"] < 1.0]
     for axes, kind, own in zip(
         panels, ("value", "gradient"), ("reference_error", "reference_gradient_error"), strict=True
     ):
         for method, (colour, marker, line) in _STYLES.items():
-            chosen = [row for row in result["rows"] if (row["of"], row["method"]) == (kind, method)]
-            places = [
-                (max(row["error"], _SMALLEST), row["microseconds"])
-                for row in chosen
-                if row["error"] is not None and row["error"] < 1.0
-            ]
+            chosen = [row for row in known if (row["of"], row["method"]) == (kind, method)]
+            places = [(max(row["error"], _SMALLEST), row["microseconds"]) for row in chosen]
             if places:
                 axes.plot(*zip(*sorted(places), strict=True), color=colour, marker=marker, ls=line, label=method)
         if result[own] > _SMALLEST:

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_panels
 
 _OTHERS = {
     CurveOutcome.OTHER_ORBIT: ("D", "another orbit"),
@@ -20,8 +20,7 @@ _OTHERS = {
 
 def approach_curve_figure(curve: ApproachCurve) -> Figure:
     """Return amplitude above and lag below; where there are none of a steady tip a mark at the foot says why."""
-    figure = new_figure(7.0, 6.4)
-    amplitude, lag = figure.subplots(2, 1, sharex=True)
+    figure, (amplitude, lag) = new_panels(7.0, 6.4, 2, sharex=True)
     for axes, values, free in (
         (amplitude, curve.amplitude_nm, curve.free_amplitude_nm),
         (lag, curve.phase_lag_deg, curve.free_phase_lag_deg),

@@ -1,5 +1,7 @@
 """Pictures of continuations: branches with their special points and bands, and curves in two parameters."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -9,7 +11,7 @@ from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.dynamics.special_points import OrbitBranch
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_panels
 from afm_jax.units import TWO_SIDED_95
 
 _MARKS = {
@@ -20,6 +22,7 @@ _MARKS = {
     "capture": ("v", DARK),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
+_HOLLOW: dict[str, Any] = {"ms": 8, "mfc": "none", "mew": 1.8, "capsize": 3, "zorder": 4}
 
 
 def continuation_figure(found: Continuation) -> Figure:
@@ -28,8 +31,7 @@ def continuation_figure(found: Continuation) -> Figure:
     Marks of special points are hollow: the branch goes on through them. Where the law has errors, 95 % of the
     amplitudes are within the ground that is coloured, and of the special points within the bars.
     """
-    figure = new_figure(7.0, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.0, 4.6)
     for number, branch in enumerate(found.branches):
         _draw_branch(axes, branch)
         if found.amplitude_errors is not None:
@@ -40,19 +42,8 @@ def continuation_figure(found: Continuation) -> Figure:
         half = None if found.special_errors is None else TWO_SIDED_95 * float(found.special_errors[index])
         marker, colour = _MARKS[point.kind]
         height = float(point.reading.peak_amplitude_nm)
-        axes.errorbar(
-            point.parameter,
-            height,
-            xerr=half,
-            fmt=marker,
-            color=colour,
-            markersize=8,
-            markerfacecolor="none",
-            markeredgewidth=1.8,
-            capsize=3,
-            zorder=4,
-            label=point.kind.replace("_", " "),
-        )
+        style = {"fmt": marker, "color": colour, "label": point.kind.replace("_", " ")}
+        axes.errorbar(point.parameter, height, xerr=half, **_HOLLOW, **style)
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.margins(x=0.02)
@@ -77,8 +68,7 @@ def _draw_branch(axes: Axes, branch: OrbitBranch) -> None:
 
 def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
     """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
-    height = branch.reading.peak_amplitude_nm
-    half = TWO_SIDED_95 * error
+    height, half = branch.reading.peak_amplitude_nm, TWO_SIDED_95 * error
     shown = np.isfinite(half) & (half < 0.3 * np.abs(height)) & branch.reading.admissible
     low, high = height - half, height + half
     axes.fill_between(branch.parameter, low, high, where=shown, color=BLUE, alpha=0.2, linewidth=0.0)
@@ -95,8 +85,7 @@ def curves_figure(found: Continuation) -> Figure:
     """
     if found.second is None:
         raise ValueError("there are no curves: no second parameter was followed")
-    figure = new_figure(7.0, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.0, 4.6)
     for curve in found.curves:
         _, colour = _MARKS[curve.kind]
         for flown, line in ((True, "-"), (False, ":")):
@@ -109,8 +98,7 @@ def curves_figure(found: Continuation) -> Figure:
                 name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
                 axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=name)
         for one in curve.meetings:
-            marker = "*" if one.kind == "cusp" else "X"
-            name = "cusp" if one.kind == "cusp" else "codimension two"
+            marker, name = ("*", "cusp") if one.kind == "cusp" else ("X", "codimension two")
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.contact.collide import Collision, Collisions
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_panels
 from afm_jax.results import known_columns
 from afm_jax.words import counted
 
@@ -25,8 +25,7 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     usable = usable[np.argsort(columns["approach_speed_nm_per_us"][usable], kind="stable")]
     columns = {name: array[usable] for name, array in columns.items()}
     approach, rebound, delay, captured = (columns[name] for name in _DRAWN)
-    figure = new_figure(8.0, 9.0)
-    panels = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
+    figure, panels = new_panels(8.0, 9.0, 3, sharex=True, height_ratios=(1.6, 1.0, 1.0))
     upper, middle, lower = panels
     end = 1.03 * max(np.max(approach, initial=0.0), np.finfo(float).tiny)
     upper.plot([0.0, end], [0.0, end], color=GRID, lw=1.2, ls="--", label=r"no loss, $u_{out} = u_{in}$")

@@ -27,7 +27,7 @@ from afm_jax.plots.picture_style import (
     cell_edges,
     label_axes,
     legend_once,
-    new_figure,
+    new_panels,
 )
 from afm_jax.units import unit_of, words_of
 
@@ -71,8 +71,7 @@ def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits) -> Figure:
         for name in ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us")
     )
     admissible, stable = np.asarray(reading.admissible).ravel(), np.asarray(orbits.stable).ravel()
-    figure = new_figure(10.0, 4.8)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = new_panels(10.0, 4.8, 1, 2)
     kinds = {
         "stable": (admissible & stable, {"marker": "o", "color": DARK}),
         "unstable": (admissible & ~stable, {"marker": "o", "color": BLUE, "markerfacecolor": "white"}),
@@ -83,10 +82,10 @@ def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits) -> Figure:
     for label, (which, style) in kinds.items():
         chosen = np.flatnonzero(exists & which)
         size = 8.0 if chosen.size <= _FEW else 3.0
-        for number, one in enumerate(chosen):
-            own = {**style, "ms": size, "label": label if number == 0 else None}
-            left.plot(np.degrees(phase[one]), velocity[one], ls=":", lw=0.8, **own)
-            right.plot(np.max(approach[one], initial=-np.inf), peak[one], ls="", **own)
+        own = {**style, "ms": size, "label": label}
+        # a line an orbit
+        left.plot(np.degrees(phase[chosen]).T, velocity[chosen].T, ls=":", lw=0.8, **own)
+        right.plot(np.max(approach[chosen], axis=1, initial=-np.inf), peak[chosen], ls="", **own)
     left.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
     # one orbit alone would have an axis of its own rounding
     left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
@@ -111,8 +110,7 @@ def exponents_figure(found: Lyapunov) -> Figure:
     """
     exponents = np.asarray(found.exponents_per_impact, float).reshape(-1, 2)
     values = np.arange(1.0, len(exponents) + 1.0) if found.along is None else found.along.values
-    figure = new_figure(9.0, 4.8)
-    axes: Axes = figure.subplots()
+    figure, axes = new_panels(9.0, 4.8)
     size = 8.0 if len(values) < 10 else max(0.8, min(3.0, 3000.0 / len(values)))
     if found.larger_interval95 is not None:
         finite = np.where(np.isfinite(found.larger_interval95), found.larger_interval95, np.nan).reshape(-1, 2)
@@ -154,8 +152,7 @@ def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "heig
         raise ValueError(f"`ordinate` must be one of {', '.join(_ORDINATES)}, but is {ordinate!r}")
     attribute, label = _ORDINATES[ordinate]
     sweeps, path = ([ramped], "") if isinstance(ramped, BifurcationDiagram) else (ramped.sweeps, ramped.parameter)
-    figure = new_figure(9.0, 8.0)
-    panels = figure.subplots(2, 1, sharex=True)
+    figure, panels = new_panels(9.0, 8.0, 2, sharex=True)
     for sweep in sweeps:
         colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
         size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [8.0, 5.0, 4.0, 1.0]))
@@ -207,8 +204,7 @@ def chart_figure(chart: StabilityChart) -> Figure:
 
     Dashed: where the probability that an orbit of an order is stable is 2.5 or 97.5 %.
     """
-    figure = new_figure(12.0, 5.2)
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, (left, right) = new_panels(12.0, 5.2, 1, 2, sharex=True, sharey=True)
     edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
     lowest, stable = chart.lowest_stable_order, chart.stable
     orders = [order for order in range(1, chart.orders + 1) if (lowest == order).any()] or [1]
@@ -249,8 +245,7 @@ def basins_figure(basins: Basins) -> Figure:
 
     Orbits that are faster than all starts have a mark at the edge.
     """
-    figure = new_figure(8.4, 6.0)
-    axes: Axes = figure.subplots()
+    figure, axes = new_panels(8.4, 6.0)
     number = min(len(basins.attractors), len(KINDS))
     degrees = np.degrees(basins.phase_rad)
     edges = cell_edges(degrees), cell_edges(basins.rebound_speed_nm_per_us)
@@ -258,8 +253,7 @@ def basins_figure(basins: Basins) -> Figure:
     axes.pcolormesh(*edges, shown, cmap=ListedColormap(KINDS[:number]), vmin=-0.5, vmax=number - 0.5, rasterized=True)
     handles: list[Any] = [
         Patch(color=KINDS[index], label=f"{attractor.name}: {100.0 * share:.3g} % of the starts")
-        for index, (attractor, share) in enumerate(zip(basins.attractors, basins.share, strict=True))
-        if index < number
+        for index, (attractor, share) in enumerate(zip(basins.attractors[:number], basins.share, strict=False))
     ]
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
     top, style = edges[1][-1], {"color": "white", "markeredgecolor": "black", "ms": 11.0, "zorder": 5}

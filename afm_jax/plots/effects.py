@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_panels
 from afm_jax.studies.effects import EffectStudy
 
 _LEAST = 1e-6
@@ -15,8 +15,9 @@ def effects_figure(study: EffectStudy) -> Figure:
     """Return two bars of change and one of time for every effect; the wanted accuracy and the full scene are lines."""
     reports = study.effects
     rows = np.arange(len(reports))
-    figure = new_figure(11.0, 2.0 + 0.55 * max(len(reports), 2))
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
+    figure, (left, right) = new_panels(
+        11.0, 2.0 + 0.55 * max(len(reports), 2), 1, 2, sharey=True, width_ratios=(1.6, 1.0)
+    )
     for label, name, colour, shift in _BARS:
         # not a number where nothing steady is left: no bar
         sizes = np.abs(np.array([getattr(report.change, name) for report in reports], float))

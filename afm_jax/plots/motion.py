@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import ContactPhase, find_junction
-from afm_jax.motion.observe import peaks_between_contacts, poincare_section
+from afm_jax.motion.observe import poincare_section
 from afm_jax.motion.record import Simulation, contacts_of
 from afm_jax.motion.settle import Settled, is_stuck, settled, slower_period_us, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory
@@ -21,7 +21,7 @@ from afm_jax.plots.picture_style import (
     DARK,
     GRID,
     label_axes,
-    new_figure,
+    new_panels,
     save,
 )
 
@@ -33,8 +33,6 @@ _BESIDE_US = 1e-7
 """How far before and after a jump its two sides are looked at."""
 _LONGEST_HELD = 4.0
 """Drive periods of a held tip that are shown: it is integrated step by step."""
-_MANY = 12
-"""Contacts from which on the peaks of all flights are shown besides."""
 _CURVES = 3
 _GAP_SHOWN_NM = 6.0
 _STROKES = ((GRID, 5.0), ("#56B4E9", 3.2), ("black", 1.4))
@@ -203,17 +201,8 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
 
 
 def course_figure(look: Look) -> Figure:
-    """Return the time course, of many contacts with the peaks of the whole motion below."""
-    overview = len(look.dense.contacts.kind) >= _MANY
-    picture = new_figure(9.0, 7.0 if overview else 4.6)
-    axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
-    _course(axes[0], look)
-    if overview:
-        _peaks(axes[1], look)
-    return picture
-
-
-def _course(axes: Axes, look: Look) -> None:
+    """Return the time course of the tip and of what drives it, with its contacts shaded."""
+    picture, axes = new_panels(9.0, 4.6)
     time = look.path.time_us
     axes.plot(time, look.path.position_nm, color="black", linewidth=1.6, label="tip")
     if look.scene.interaction is not None:
@@ -225,30 +214,17 @@ def _course(axes: Axes, look: Look) -> None:
     shade_phases(axes, look.path, look.scene.interaction)
     axes.axhline(0.0, color=GRID, linewidth=0.8)
     axes.set_xlim(look.from_us, look.to_us)
-    _with_legend_above(axes, x="time (µs)", y="height (nm)")
+    # room for the legend above the curves
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
+    label_axes(axes, x="time (µs)", y="height (nm)")
+    axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
     count = len(look.dense.contacts.kind)
     what = f"The last contacts of {count}" if count else "Last periods"
     if is_stuck(look.scene, look.dense.simulation):
         what += ", the sample holds the tip"
     axes.set_title(what, fontsize=12, loc="left")
-
-
-def _with_legend_above(axes: Axes, *, x: str, y: str) -> None:
-    """Label the axes, and put a legend into room above the curves."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.22 * (high - low))
-    label_axes(axes, x=x, y=y)
-    axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
-
-
-def _peaks(axes: Axes, look: Look) -> None:
-    """Draw the peak after each contact over the whole motion, and mark the stretch above."""
-    peaks = peaks_between_contacts(look.scene, look.dense.simulation)
-    axes.plot(look.dense.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
-    axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
-    axes.axhline(0.0, color=GRID, linewidth=0.8)
-    what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
-    _with_legend_above(axes, x="time (µs)", y=f"peak after each {what} (nm)")
+    return picture
 
 
 def _around(look: Look, row: int) -> tuple[float, float]:
@@ -262,8 +238,7 @@ def _around(look: Look, row: int) -> tuple[float, float]:
 
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
-    picture = new_figure(12.0, 5.0)
-    whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
+    picture, (whole, part) = new_panels(12.0, 5.0, 1, 2, width_ratios=[1.0, 1.5])
     rows = np.arange(len(look.dense.contacts.kind))[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
@@ -295,14 +270,12 @@ _LEAST_SHOWN = 0.02
 def section_figure(look: Look) -> Figure:
     """Return the Poincaré section, the order in time as a shade."""
     phase, rows = poincare_section(look.scene, look.dense.simulation)
-    picture = new_figure(7.5, 5.4)
-    axes = picture.subplots()
+    picture, axes = new_panels(7.5, 5.4)
     velocity = rows.departure_velocity_nm_per_us
     size = 30 if phase.size < 100 else 8
     axes.plot(phase[-1], velocity[-1], "o", color="black", markersize=11, fillstyle="none", label="the last one")
     shades = axes.scatter(phase, velocity, c=np.arange(1, phase.size + 1), s=size, cmap="viridis_r", zorder=3)
-    bar = picture.colorbar(shades, ax=axes)
-    bar.set_label("contact", fontsize=11)
+    picture.colorbar(shades, ax=axes, label="contact")
     label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
     axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
     # what is left of a settled motion is rounding: the axis does not magnify it
@@ -314,15 +287,10 @@ def section_figure(look: Look) -> Figure:
     return picture
 
 
-class Spectrum(NamedTuple):
-    """Amplitudes of the waves that a deflection is made of."""
+def spectrum_of(look: Look) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Return frequencies in kHz and amplitudes in nm of the waves that the deflection is made of.
 
-    frequency_khz: Float[np.ndarray, " lines"]
-    amplitude_nm: Float[np.ndarray, " lines"]
-
-
-def spectrum_of(look: Look) -> Spectrum:
-    """Return the spectrum over the last whole response periods, from equally spaced samples.
+    They are those of the last whole response periods, from equally spaced samples.
 
     The samples end with the last whole response period, so that a motion that repeats has lines without skirts; one
     that does not is weighted with a Hann window.
@@ -342,19 +310,18 @@ def spectrum_of(look: Look) -> Spectrum:
     mean = float(np.sum(weight * deflection) / weight.sum())
     amplitude = 2.0 * np.abs(np.fft.rfft((deflection - mean) * weight)) / weight.sum()
     amplitude[0] = abs(mean)
-    return Spectrum(1e3 * np.fft.rfftfreq(samples, step), amplitude)
+    return 1e3 * np.fft.rfftfreq(samples, step), amplitude
 
 
 def spectrum_figure(look: Look) -> Figure:
     """Return the spectrum, with the drive, a second tone, the response and the free vibration marked."""
-    found, repeats = spectrum_of(look), look.responses.repeats
-    picture = new_figure(9.0, 5.0)
-    axes = picture.subplots()
+    (frequency, amplitude), repeats = spectrum_of(look), look.responses.repeats
+    picture, axes = new_panels(9.0, 5.0)
     drive, response = 1e3 / look.drive.period_us, 1e3 / look.responses.response_us
     free, tones = float(look.scene.cantilever.frequency_khz), _further_tones_khz(look.scene, drive)
     right = max(_HIGHEST * min(response, 2.0 * free), 2.2 * drive, *(1.1 * tone for tone in tones))
-    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= right)
-    frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
+    shown = (frequency > 0.0) & (frequency <= right)
+    frequency, amplitude = frequency[shown], amplitude[shown]
     floor, top = max(float(amplitude.max()) * _DECADES, 1e-12), float(amplitude.max()) * 30.0
     if repeats:
         axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)

@@ -33,6 +33,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
+def new_panels(
+    width_in: float, height_in: float, rows: int = 1, columns: int = 1, **options: Any
+) -> tuple[Figure, Any]:
+    """Return an empty figure of a size in inches, and its axes as `Figure.subplots` gives them, with its options."""
+    figure = new_figure(width_in, height_in)
+    return figure, figure.subplots(rows, columns, **options)
+
+
 def label_axes(axes: Axes, *, x: str, y: str, grid: bool = True) -> None:
     """Label both axes in the common size, ticks inside the labels' size; draw a light grid where that hides nothing."""
     axes.set_xlabel(x, fontsize=_FONT + 1)

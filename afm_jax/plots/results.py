@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_panels
 from afm_jax.results import known_columns, known_rows
 from afm_jax.units import unit_of, words_of
 
@@ -36,21 +36,19 @@ def _curves(columns: dict[str, np.ndarray]) -> Figure:
     for name, y in others:
         panels.setdefault(unit_of(name), []).append((name, y))
     shown = sorted(panels.items(), key=lambda each: (not each[0], -len(each[1])))[:_MOST_PANELS]
-    figure = new_figure(8.0, 1.2 + 2.4 * max(len(shown), 1))
+    figure, below = new_panels(8.0, 1.2 + 2.4 * max(len(shown), 1), max(len(shown), 1), squeeze=False)
     marker = "." if x.size > 40 else "o"
     steady = x.size > 1 and bool(np.all(np.diff(x) > 0.0))
-    for number, (unit, curves) in enumerate(shown):
-        axes = figure.add_subplot(len(shown), 1, number + 1)
+    for axes, (unit, curves) in zip(below[:, 0], shown, strict=False):
         for colour, (name, y) in zip(_COLOURS, curves, strict=False):
             axes.plot(x, y, marker, linestyle="-" if steady else "", color=colour, label=words_of(name), markersize=4)
-        label_axes(axes, x=_label(first) if number == len(shown) - 1 else "", y=unit)
+        label_axes(axes, x=_label(first) if axes is below[-1, 0] else "", y=unit)
         axes.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
 def _map(name: str, plane: np.ndarray) -> Figure:
-    figure = new_figure(7.0, 5.0)
-    axes = figure.add_subplot()
+    figure, axes = new_panels(7.0, 5.0)
     image = axes.imshow(plane.reshape(plane.shape[0], -1), origin="lower", aspect="auto", interpolation="nearest")
     label_axes(axes, x="column", y="row", grid=False)
     figure.colorbar(image, label=_label(name))

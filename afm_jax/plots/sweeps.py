@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import label_axes, new_figure
+from afm_jax.plots.picture_style import label_axes, new_panels
 
 if TYPE_CHECKING:
     import xarray
@@ -39,8 +39,7 @@ def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
     is_plane = len(axes) == 2 or len(swept) == 2
     layers = {name: _layers(shown[[name]], axes) if is_plane else [shown[[name]]] for name in names}
     rows = max(map(len, layers.values()))
-    figure = new_figure(6.4 * len(names), 4.4 * rows)
-    panels = figure.subplots(rows, len(names), squeeze=False)
+    figure, panels = new_panels(6.4 * len(names), 4.4 * rows, rows, len(names), squeeze=False)
     for column, name in enumerate(names):
         for row, panel in enumerate(panels[:, column]):
             if row < len(layers[name]):
