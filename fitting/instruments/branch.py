@@ -95,9 +95,8 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> Br
         part = (near >= slope.from_nm) & (near <= slope.to_nm)
         onset = float(near[part].mean() + (level - fallen[part].mean()) / slope.value)
     edge = offset[first] if first < last else np.inf
-    free = offset < edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
-    if free.sum() < _FEWEST:
-        free = np.arange(len(values)) < max(first, 1)
+    # the farthest row even where all are in contact
+    free = offset <= edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
     change = _change(offset, values)
     lag = None if lag_deg is None else lag_deg[order][free]
     jump = _jump(values[free], lag) if change is None else None
@@ -188,10 +187,10 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
         return None
     length = max(_WINDOW_NM, 5.0 * float(np.median(np.diff(offset))))
     starts = np.searchsorted(offset, offset - length, side="left").tolist()
-    windows = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
+    lines = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
+    windows = [(a, b, line) for a, b, line in lines if line is not None]
     # windows that the far end cuts off count only where there is no whole one
     whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
-    whole = [(a, b, line) for a, b, line in whole if line is not None]
     chosen, first, last = _line(offset, values), 0, rows
     if whole:
         slopes, errors, scatters = np.array([line for *_, line in whole]).T

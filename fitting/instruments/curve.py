@@ -173,7 +173,10 @@ def read_curves(
     known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
     wanted = parse_columns(columns)
     recording = read_recording(path)
-    _refuse_others(recording)
+    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
+    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
+        what = "thermal spectrum" if spectrum else "resonance sweep"
+        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
     stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
     known = recording.known | known
@@ -200,13 +203,6 @@ def read_curves(
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
-
-
-def _refuse_others(recording: Recording) -> None:
-    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
-    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
-        what = "thermal spectrum" if spectrum else "resonance sweep"
-        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
 
 
 def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:

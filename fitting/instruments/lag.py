@@ -31,8 +31,6 @@ _MORE = 5.0
 """How many times more rows must contradict the one sign than the other."""
 _TOLERANCE_DEG = 0.5
 """What phases may drift by along a curve."""
-_UNKNOWN_DEG = 90.0
-"""Error of a zero of the phase that nothing tells."""
 _CLEAR_DEG = 1.0
 """Departure from the free tip's phase, beyond errors, that says on which side a row is."""
 _ON_RESONANCE = 0.5
@@ -138,12 +136,12 @@ class PhaseReadings(NamedTuple):
         return float(np.max(np.abs(self.energy(quarter) - self.energy(-quarter)) / (2.0 * self.ratio)))
 
     def giving_energy_away(self, sign: float) -> int:
-        """Return how many rows have energies below zero beyond all errors, the phase taken with a sign."""
+        """Return how many rows have energies below zero beyond all errors, the phase of known zero taken with a sign."""
         behind = self.behind_deg(sign)
         start = self.energy(behind)
         lag_error = np.hypot(self.phase_error_deg, _TOLERANCE_DEG)
-        if not self.seen_free.any():
-            lag_error = np.hypot(lag_error, _UNKNOWN_DEG if self.zero is None else self.zero[1])
+        if not self.seen_free.any() and self.zero is not None:
+            lag_error = np.hypot(lag_error, self.zero[1])
         changes = (
             {"ratio": self.ratio + self.ratio_error},
             {"frequency_ratio": self.frequency_ratio * (1.0 + self.frequency_error)},
@@ -239,19 +237,17 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     by_energy = readings.sign_by_energy() if known_zero else None
     # energies of all rows hardly depend on the sign
     on_resonance = readings.detuning <= _ON_RESONANCE / readings.quality_factor
+    off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
     decided = {
         "stated": SENSES.get(stated),
         "energy": by_energy or None,
         "order": readings.sign_by_order() if on_resonance and known_zero else None,
+        "assumed" if on_resonance else "unknown": -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0,
     }
-    origin = next((name for name, sign in decided.items() if sign is not None), "")
-    sign = decided.get(origin)
-    if sign is None:
-        origin = "assumed" if on_resonance else "unknown"
-        off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
-        sign = -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0
+    # the first that decides
+    origin, sign = next((name, sign) for name, sign in decided.items() if sign is not None)
     zero = float(np.median(readings.zero_deg(sign)))
-    reason, rows = "", readings.giving_energy_away(sign)
+    reason = ""
     if by_energy == 0.0:
         reason = (
             "with either sign of the phase taps would gain energy: frequency, Q, the drive (force or base) or the "
@@ -259,8 +255,8 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
         )
     elif by_energy is not None and by_energy != sign:
         reason = (
-            f"the phase was stated to {'lag' if sign > 0.0 else 'lead'}, but then {rows} taps would gain energy, and "
-            f"with the other sign they do not: {SENSE_OPTION}"
+            f"the phase was stated to {'lag' if sign > 0.0 else 'lead'}, but then {readings.giving_energy_away(sign)} taps "
+            f"would gain energy, and with the other sign they do not: {SENSE_OPTION}"
         )
     elif origin == "unknown":
         reason = (
