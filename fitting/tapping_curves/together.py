@@ -26,8 +26,6 @@ from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import energies_of_table
 from fitting.tapping_curves.verdict import ORIGINS
 
-_SAME = 0.03
-"""Relative difference of free amplitudes up to which branches of several curves are compared."""
 _POINTS = 41
 
 
@@ -199,10 +197,10 @@ def _scatters(curves: Sequence[Tapping]) -> tuple[CurveScatter, ...]:
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
-    """Say whether two branches are compared: of one frequency, way and side, and nearly one free amplitude."""
+    """Say whether two branches are compared: of one frequency, way and side, and one free amplitude to 3 %."""
     apart = abs(one.free_amplitude_nm - other.free_amplitude_nm)
     return (one.drive_frequency_khz, one.name) == (other.drive_frequency_khz, other.name) and (
-        apart < _SAME * one.free_amplitude_nm
+        apart < 0.03 * one.free_amplitude_nm
     )
 
 
