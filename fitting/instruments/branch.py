@@ -9,10 +9,6 @@ Rows = Float[np.ndarray, " rows"]
 JUMP = 0.02
 """Change of the free amplitude, as a share of it, that is called a jump."""
 _FEWEST = 5
-_DEEP, _SHALLOW = 0.1, 0.9
-"""Fractions of the free amplitude between which the slope of a curve that goes deep is read."""
-_FLAT, _FLAT_DEG = 0.005, 1.0
-"""What blocks of the free tip may differ by: of the amplitude, and in degrees."""
 
 
 class ContactSlope(NamedTuple):
@@ -70,7 +66,8 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> Br
     scatter = 1.48 * float(np.median(np.abs(high - level)))
     first, last = _contact(values, level, scatter)
     touching = slice(first, last)
-    engaged = values[touching] > _DEEP * level
+    # of a curve that goes deep the slope is read between 0.1 and 0.9 of the free amplitude
+    engaged = values[touching] > 0.1 * level
     near, fallen = offset[touching][engaged], values[touching][engaged]
     slope = steepest_part(near, fallen, deep=bool(values.min() < 0.5 * level))
     onset = None
@@ -102,7 +99,8 @@ def _plateau_end(values: Rows, lag: Rows | None) -> int:
     if len(ends) < 4:
         return rows
     until = rows
-    for column, flat in ((values, _FLAT * abs(float(np.median(values)))), (lag, _FLAT_DEG)):
+    # blocks of the free tip may differ by 0.005 of the amplitude, and by a degree
+    for column, flat in ((values, 0.005 * abs(float(np.median(values)))), (lag, 1.0)):
         if column is None:
             continue
         middles = np.array([np.median(column[end - size : end]) for end in ends])
@@ -145,7 +143,7 @@ def _scatter(values: Rows) -> float:
 def _contact(values: Rows, level: float, scatter: float) -> tuple[int, int]:
     """Return from which row on, up to which, the amplitude is reduced: from the nearest outwards until it is back."""
     deep = values.min() < 0.5 * level
-    highest = _SHALLOW * level if deep else level - max(5.0 * min(scatter, 0.02 * level), 0.01 * level)
+    highest = 0.9 * level if deep else level - max(5.0 * min(scatter, 0.02 * level), 0.01 * level)
     low = np.flatnonzero(values < highest)
     if not low.size:
         return 0, 0

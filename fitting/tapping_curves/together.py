@@ -26,8 +26,6 @@ from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import energies_of_table
 from fitting.tapping_curves.verdict import ORIGINS
 
-_POINTS = 41
-
 
 @dataclass(frozen=True, eq=False)
 class CurveScatter(CurveBranch):
@@ -210,7 +208,7 @@ def _scatter(members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | Non
     if len(members) < 2:
         return None
     ends = [branch.curve.amplitude_ratio[[0, -1]] for _, branch in members]
-    ratio = np.linspace(np.min(ends), np.max(ends), _POINTS)
+    ratio = np.linspace(np.min(ends), np.max(ends), 41)
     columns = np.array([_parts_at(ratio, one, branch) for one, branch in members])
     enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
     ratio, (energy, estimate, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
