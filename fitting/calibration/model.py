@@ -29,7 +29,6 @@ Points = Float[np.ndarray, " points"]
 Response = Complex[np.ndarray, " points"]
 _LEAST_SQUARE = 1e-12
 """Of a modelled square, in units of the largest: a trial step may leave less, or a negative one, whose root is none."""
-_STEPS, _SETTLED = 100, 1e-20
 
 
 def measured_response(sweep: Resonance) -> Response:
@@ -139,7 +138,7 @@ def minimum(sweep: Resonance, error: Points) -> tuple[Lowest, Response, bool]:
     _, start, signed = min(starts, key=lambda start: start[0])
     longest = np.append([1.0, 1.0], np.full(len(start) - 2, np.inf))
     best = levenberg_marquardt(
-        lambda place: _evaluate(sweep, signed, error, place)[0], start, settled=_SETTLED, most=_STEPS, longest=longest
+        lambda place: _evaluate(sweep, signed, error, place)[0], start, settled=1e-20, most=100, longest=longest
     )
     return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
 

@@ -159,14 +159,10 @@ def model_of(prior: Prior, drives: Drives, values: Float[np.ndarray, " p"]) -> t
         law = FormulaLaw(problem.own, prior.fixed, mass, lasting=problem.lasting)
     theta = np.zeros(len(values))
     for i, (parameter, value) in enumerate(zip(problem.parameters[:own], values.tolist(), strict=False)):
-        # a logarithm knows no 0
-        theta[i] = law.unknown_of(parameter.name, value if parameter.lowest < 0.0 else max(value, _LEAST))
+        # 1e-12 stands for 0 where the unknown is a logarithm
+        theta[i] = law.unknown_of(parameter.name, value if parameter.lowest < 0.0 else max(value, 1e-12))
     pairs = zip(problem.names[own:], values[own:].tolist(), strict=True)
     return Model(data, law, tuple(Quantity(name, value, 1.0, ~never) for name, value in pairs)), theta
-
-
-_LEAST = 1e-12
-"""Stands for 0 where an unknown is the logarithm of a parameter."""
 
 
 def explained(

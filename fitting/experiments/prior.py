@@ -26,7 +26,6 @@ from fitting.tables.csv_text import FARTHEST, TableError, read_bytes
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
-DRAW_SEED = 1997
 MARGIN = 0.05
 """Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
 seems to be known: a law is none of a real contact to better than that where its orbits end."""
@@ -80,7 +79,7 @@ class Prior(Result):
         spread[own:] = 1.0 / np.sqrt(np.maximum(np.diag(self.information)[own:], spread[own:] ** -2.0))
         # in units of the spread the information has eigenvalues of at least 1
         curvature, axes = np.linalg.eigh(spread[:, None] * self.information * spread + np.eye(spread.size))
-        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, spread.size))
+        normal = np.random.default_rng(1997).normal(size=(count, spread.size))
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), MARGIN / self.uncertainty)
         ends = np.array([(known.lowest, known.highest) for known in self.problem.parameters]).T

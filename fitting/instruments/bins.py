@@ -16,13 +16,7 @@ Bins = Float[np.ndarray, " bins"]
 Places = Int[np.ndarray, " rows"]
 _ROWS = 5
 """Rows in a bin of the usual width, at least; as many are needed for a scatter of their own."""
-_MOST = 200
-"""Bins of the usual width in a branch."""
-_FEWEST = 100
-"""Rows of a branch from which it gets bins of a width; of fewer only rows of equal height are merged."""
 _NEIGHBOURS = 4
-_ONE_RAMP = 0.1
-"""Share of a branch's rows that the rows of a bin may be spread over, for the bins to be in the order of time."""
 
 
 def ways_of(offset_nm: Rows, branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
@@ -40,10 +34,10 @@ def faults_of_order(offset_nm: Rows, branch: np.ndarray) -> tuple[int, int]:
 def usual_width(offset_nm: Rows, branch: np.ndarray) -> float:
     """Return the width in nm of bins for a curve whose heights repeat or are not in order.
 
-    The width is that of five rows, or of a 200th of them; 0 (only rows of equal height are merged) for few rows.
+    The width is that of five rows, or of a 200th of them; 0 (only rows of equal height are merged) for fewer than 100.
     """
-    ways = [way for way in ways_of(offset_nm, branch).values() if len(way) >= _FEWEST]
-    return max((float(np.ptp(way)) * max(_ROWS / len(way), 1.0 / _MOST) for way in ways), default=0.0)
+    ways = [way for way in ways_of(offset_nm, branch).values() if len(way) >= 100]
+    return max((float(np.ptp(way)) * max(_ROWS / len(way), 1.0 / 200) for way in ways), default=0.0)
 
 
 def binned(
@@ -78,7 +72,8 @@ def binned(
         _, place, counts = np.unique(number, return_inverse=True, return_counts=True)
         time = _means(place, rows.astype(float))
         spread = np.sqrt(np.maximum(_means(place, (rows - time[place]) ** 2.0), 0.0))
-        in_order &= bool(np.median(spread) <= _ONE_RAMP * len(rows) + 1.0)
+        # rows of a bin that are spread over more than a tenth of the branch are of several ramps
+        in_order &= bool(np.median(spread) <= 0.1 * len(rows) + 1.0)
         whole = np.bincount(place, free[rows]) == counts
         # the nearer half of the free rows may feel the sample already
         whole &= np.cumsum(whole) <= 0.5 * whole.sum()
@@ -89,16 +84,12 @@ def binned(
                 scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
                 # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
                 error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)
-            found |= {key: means, error_of(key): error}
+            # `phase_lag_error_deg` of `phase_lag_deg`
+            stem, _, unit = key.rpartition("_")
+            found |= {key: means, f"{stem}_error_{unit}": error}
         for key, column in found.items():
             columns.setdefault(key, []).append(column[:: 1 if name == "approach" else -1])
     return {key: np.concatenate(parts) for key, parts in columns.items()}, in_order
-
-
-def error_of(name: str) -> str:
-    """Return the name of the column of errors of a reading: `phase_lag_error_deg` of `phase_lag_deg`."""
-    stem, _, unit = name.rpartition("_")
-    return f"{stem}_error_{unit}"
 
 
 def _means(place: Places, values: Rows) -> Bins:

@@ -9,26 +9,6 @@ Rows = Float[np.ndarray, " rows"]
 JUMP = 0.02
 """Change of the free amplitude, as a share of it, that is called a jump."""
 _FEWEST = 5
-_DEEP, _SHALLOW = 0.1, 0.9
-"""Fractions of the free amplitude between which the slope of a curve that goes deep is read."""
-_PARTS = 20
-"""Blocks that the rows in front of the contact are looked at in."""
-_FLAT, _FLAT_DEG = 0.005, 1.0
-"""What blocks of the free tip may differ by: of the amplitude, and in degrees."""
-_TURNS_DEG = 3.0
-"""Change of the lag with which a change of the amplitude is that of first contact."""
-_SLOPING = 0.01
-"""Change of the amplitude over the farthest quarter of the rows, of the amplitude, from which there is no free part."""
-_WINDOW_NM = 1.0
-"""Height over which the slope in contact is read at least."""
-_VAGUE = 4.0
-"""Standard errors that a slope must differ from 0 by."""
-_PRECISE = 0.03
-"""Relative error of the slope up to which no more rows are taken in."""
-_ALIKE = 0.8
-"""Slope through all rows of a deep curve, over that of the steepest part, from which there is no plateau."""
-_SETTLED = 3.0
-"""Scatter about a line, over that of most windows, up to which a window is settled."""
 
 
 class ContactSlope(NamedTuple):
@@ -86,7 +66,8 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> Br
     scatter = 1.48 * float(np.median(np.abs(high - level)))
     first, last = _contact(values, level, scatter)
     touching = slice(first, last)
-    engaged = values[touching] > _DEEP * level
+    # of a curve that goes deep the slope is read between 0.1 and 0.9 of the free amplitude
+    engaged = values[touching] > 0.1 * level
     near, fallen = offset[touching][engaged], values[touching][engaged]
     slope = steepest_part(near, fallen, deep=bool(values.min() < 0.5 * level))
     onset = None
@@ -95,9 +76,8 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> Br
         part = (near >= slope.from_nm) & (near <= slope.to_nm)
         onset = float(near[part].mean() + (level - fallen[part].mean()) / slope.value)
     edge = offset[first] if first < last else np.inf
-    free = offset < edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
-    if free.sum() < _FEWEST:
-        free = np.arange(len(values)) < max(first, 1)
+    # the farthest row even where all are in contact
+    free = offset <= edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
     change = _change(offset, values)
     lag = None if lag_deg is None else lag_deg[order][free]
     jump = _jump(values[free], lag) if change is None else None
@@ -112,14 +92,15 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> Br
 
 
 def _plateau_end(values: Rows, lag: Rows | None) -> int:
-    """Return how many rows, the farthest first, are of the free tip: until blocks of them leave the farthest ones."""
+    """Return how many rows, the farthest first, are of the free tip: until blocks of a 20th leave the farthest ones."""
     rows = len(values)
-    size = max(rows // _PARTS, _FEWEST)
+    size = max(rows // 20, _FEWEST)
     ends = [size * k for k in range(1, rows // size + 1)]
     if len(ends) < 4:
         return rows
     until = rows
-    for column, flat in ((values, _FLAT * abs(float(np.median(values)))), (lag, _FLAT_DEG)):
+    # blocks of the free tip may differ by 0.005 of the amplitude, and by a degree
+    for column, flat in ((values, 0.005 * abs(float(np.median(values)))), (lag, 1.0)):
         if column is None:
             continue
         middles = np.array([np.median(column[end - size : end]) for end in ends])
@@ -148,7 +129,8 @@ def _change(offset: Rows, values: Rows) -> float | None:
     change = slope * float(np.ptp(offset[:rows]) / np.median(far))
     # a step is a jump of the free amplitude, not a fall
     of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
-    falls = abs(change) > _SLOPING and abs(slope) > 5.0 * error and scatter**2 * (rows - 2) < of_step
+    # over the farthest quarter a free part changes by 1 % at most
+    falls = abs(change) > 0.01 and abs(slope) > 5.0 * error and scatter**2 * (rows - 2) < of_step
     return change if falls else None
 
 
@@ -161,7 +143,7 @@ def _scatter(values: Rows) -> float:
 def _contact(values: Rows, level: float, scatter: float) -> tuple[int, int]:
     """Return from which row on, up to which, the amplitude is reduced: from the nearest outwards until it is back."""
     deep = values.min() < 0.5 * level
-    highest = _SHALLOW * level if deep else level - max(5.0 * min(scatter, 0.02 * level), 0.01 * level)
+    highest = 0.9 * level if deep else level - max(5.0 * min(scatter, 0.02 * level), 0.01 * level)
     low = np.flatnonzero(values < highest)
     if not low.size:
         return 0, 0
@@ -186,34 +168,38 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     rows = len(values)
     if rows < 4 or np.ptp(offset) == 0.0:
         return None
-    length = max(_WINDOW_NM, 5.0 * float(np.median(np.diff(offset))))
+    # 1 nm at least
+    length = max(1.0, 5.0 * float(np.median(np.diff(offset))))
     starts = np.searchsorted(offset, offset - length, side="left").tolist()
-    windows = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
+    lines = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
+    windows = [(a, b, line) for a, b, line in lines if line is not None]
     # windows that the far end cuts off count only where there is no whole one
     whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
-    whole = [(a, b, line) for a, b, line in whole if line is not None]
     chosen, first, last = _line(offset, values), 0, rows
     if whole:
         slopes, errors, scatters = np.array([line for *_, line in whole]).T
-        settled = scatters <= _SETTLED * np.median(scatters) + 1e-12
+        # settled is a window that scatters about its line by three times what most do, at most
+        settled = scatters <= 3.0 * np.median(scatters) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
         start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
         start = _straight_from(offset[: end + 1], values[: end + 1], start)
         part = _line(offset[start : end + 1], values[start : end + 1])
-        if not (deep and part is not None and chosen is not None and chosen[0] < _ALIKE * part[0]):
+        # with a plateau the line through all rows has less than 0.8 of the slope of the steepest part
+        if not (deep and part is not None and chosen is not None and chosen[0] < 0.8 * part[0]):
             chosen, first, last = part, start, end + 1
-    if chosen is None or not chosen[0] < -_VAGUE * chosen[1]:
+    # a slope differs from 0 by four standard errors
+    if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
     return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]))
 
 
 def _straight_from(offset: Rows, values: Rows, first: int) -> int:
-    """Return from which row on the slope is known well enough, as far as the rows up to the last lie on a line."""
+    """Return from which row on the slope is known to 3 %, as far as the rows up to the last lie on a line."""
     step = max(len(offset) - first, 4) // 4
     while first > 0:
         line = _line(offset[first:], values[first:])
-        if line is not None and line[1] < _PRECISE * abs(line[0]):
+        if line is not None and line[1] < 0.03 * abs(line[0]):
             return first
         trial = max(first - step, 0)
         place = offset[trial:] - offset[trial:].mean()
@@ -257,7 +243,8 @@ def _jump(values: Rows, lag: Rows | None) -> tuple[float, float] | None:
     turn = 0.0
     if lag is not None:
         turn = float(np.percentile(np.abs(lag[counts[most] :] - np.median(lag[: counts[most]])), 75.0))
-    if falls > 0.5 * abs(high - low) or turn > _TURNS_DEG:
+    # a change of the amplitude with one of the lag by 3 degrees is that of first contact
+    if falls > 0.5 * abs(high - low) or turn > 3.0:
         return None
     # a drift spreads over the rows, a jump happens between two of them
     near = values[max(counts[most] - 10, 0) : counts[most]].mean(), values[counts[most] : counts[most] + 10].mean()

@@ -197,15 +197,10 @@ def columns_to_paste(recording: Recording, roles: Iterable[str] = CURVE) -> str:
     return f'say `columns="{",".join(parts)}"`'
 
 
-_TURN = 0.3
-"""Of the range of heights: what a height goes back by where the sample turns."""
-_LEAST_RUN = 8
-"""Rows between two turns on the average, below which heights jump to and fro and are no ramps."""
-
-
 def turns_of(height: Float[np.ndarray, " rows"]) -> list[int]:
     """Return the rows at which a height turns for good, the first of each new direction; none where it jumps about."""
-    least = _TURN * float(np.ptp(height)) if len(height) else 0.0
+    # a sample that turns goes back by 0.3 of the range of heights
+    least = 0.3 * float(np.ptp(height)) if len(height) else 0.0
     turns: list[int] = []
     rising, extreme = 0, 0
     low = high = 0
@@ -219,4 +214,5 @@ def turns_of(height: Float[np.ndarray, " rows"]) -> list[int]:
         elif rising * (height[extreme] - value) > least:
             turns.append(extreme + 1)
             rising, extreme = -rising, row
-    return turns if len(height) >= _LEAST_RUN * (len(turns) + 1) else []
+    # with fewer than 8 rows between two turns heights jump to and fro, and are no ramps
+    return turns if len(height) >= 8 * (len(turns) + 1) else []

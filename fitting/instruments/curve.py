@@ -173,7 +173,10 @@ def read_curves(
     known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
     wanted = parse_columns(columns)
     recording = read_recording(path)
-    _refuse_others(recording)
+    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
+    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
+        what = "thermal spectrum" if spectrum else "resonance sweep"
+        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
     stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
     known = recording.known | known
@@ -200,13 +203,6 @@ def read_curves(
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
-
-
-def _refuse_others(recording: Recording) -> None:
-    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
-    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
-        what = "thermal spectrum" if spectrum else "resonance sweep"
-        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
 
 
 def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:
@@ -312,17 +308,14 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
     return columns
 
 
-_AWAY = 0.95
-"""Amplitude far from the sample over that near to it below which heights run the other way."""
-
-
 def _runs_away(curve: MeasuredCurve) -> bool:
     """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
     if curve.amplitude is None or any(look.slope is not None for look in _looks(curve).values()):
         return False
     amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
     some = max(len(amplitude) // 20, 1)
-    return bool(np.median(amplitude[:some]) < _AWAY * np.median(amplitude[-some:]))
+    # heights run the other way where the far end has less than 0.95 of the amplitude near the sample
+    return bool(np.median(amplitude[:some]) < 0.95 * np.median(amplitude[-some:]))
 
 
 def _as_named(curve: MeasuredCurve) -> list[bool]:
@@ -353,7 +346,12 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     known, looks, notes = curve.known, _looks(curve), list(curve.notes)
     slope = _mean_slope(looks) if of_slope else None
     if slope is not None:
-        known["nm_per_volt"] = _scale_of_slope(curve, slope, looks)
+        # with this scale the amplitude falls by 1 nm per nm in contact
+        scale = 1.0 / abs(slope[0])
+        found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
+        parts = " and ".join(f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found)
+        how = f"measured: slope of the steepest settled part ({parts}), assumed to be 1 nm per nm (a hard sample)"
+        known["nm_per_volt"] = Known(scale, f"nm/{curve.amplitude_unit}", how, scale * slope[1] / abs(slope[0]))
     if "nm_per_volt" in known and (slope is not None or curve.amplitude_unit == "V"):
         amplitude = curve.amplitude * float(known["nm_per_volt"].value)
         curve = replace(curve, amplitude=amplitude, amplitude_unit="nm")
@@ -392,15 +390,6 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
     chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
     return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
-
-
-def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Mapping[str, BranchLook]) -> Known:
-    """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
-    scale, unit = 1.0 / abs(slope[0]), curve.amplitude_unit
-    found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
-    parts = [f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
-    how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
-    return Known(scale, f"nm/{unit}", f"measured: {how}", scale * slope[1] / abs(slope[0]))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
@@ -455,8 +444,6 @@ def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
 
 _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
-_RADIANS_DEG = 30.0
-"""How near to the free tip's lag its phase, read as radians, must be to be recognized as such."""
 
 
 def _add_phase(
@@ -481,7 +468,8 @@ def _add_phase(
     readings = _phase_readings(curve, looks)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
-    near = abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG < lag
+    # read as radians the phase is the lag of the free tip within 30 degrees
+    near = abs(np.rad2deg(abs(level)) - lag) < 30.0 < lag
     if near and np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(level)) > 0.5 * lag:
         raise TableError(
             f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "

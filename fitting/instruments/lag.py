@@ -27,16 +27,6 @@ _SURE = 4.0
 """Standard errors below zero from which an energy is impossible."""
 _FEWEST, _SHARE = 3, 0.05
 """Rows from which energies below zero speak against a sign, and share of the taps from which against both."""
-_MORE = 5.0
-"""How many times more rows must contradict the one sign than the other."""
-_TOLERANCE_DEG = 0.5
-"""What phases may drift by along a curve."""
-_UNKNOWN_DEG = 90.0
-"""Error of a zero of the phase that nothing tells."""
-_CLEAR_DEG = 1.0
-"""Departure from the free tip's phase, beyond errors, that says on which side a row is."""
-_ON_RESONANCE = 0.5
-"""Of 1/Q: least |1 - s^2| off resonance, where the sign of the phase decides on energies."""
 _NEAR_DEG = 20.0
 """How near to a lag of the opposite sign the free tip's phase must be to be taken for one, on resonance."""
 
@@ -138,12 +128,13 @@ class PhaseReadings(NamedTuple):
         return float(np.max(np.abs(self.energy(quarter) - self.energy(-quarter)) / (2.0 * self.ratio)))
 
     def giving_energy_away(self, sign: float) -> int:
-        """Return how many rows have energies below zero beyond all errors, the phase taken with a sign."""
+        """Return how many rows have energies below zero beyond all errors, with a sign of a phase of known zero."""
         behind = self.behind_deg(sign)
         start = self.energy(behind)
-        lag_error = np.hypot(self.phase_error_deg, _TOLERANCE_DEG)
-        if not self.seen_free.any():
-            lag_error = np.hypot(lag_error, _UNKNOWN_DEG if self.zero is None else self.zero[1])
+        # phases may drift by half a degree along a curve
+        lag_error = np.hypot(self.phase_error_deg, 0.5)
+        if not self.seen_free.any() and self.zero is not None:
+            lag_error = np.hypot(lag_error, self.zero[1])
         changes = (
             {"ratio": self.ratio + self.ratio_error},
             {"frequency_ratio": self.frequency_ratio * (1.0 + self.frequency_error)},
@@ -162,7 +153,8 @@ class PhaseReadings(NamedTuple):
         taps = np.sum(np.isfinite(self.phase_deg) & (self.ratio > LEAST_RATIO) & ~self.free)
         against = {sign: self.giving_energy_away(sign) for sign in (1.0, -1.0)}
         for sign, count in against.items():
-            if against[-sign] >= _FEWEST and against[-sign] > _MORE * count:
+            # five times more rows contradict the other sign
+            if against[-sign] >= _FEWEST and against[-sign] > 5.0 * count:
                 return sign
         return 0.0 if min(against.values()) >= max(_FEWEST, _SHARE * float(taps)) else None
 
@@ -176,7 +168,8 @@ class PhaseReadings(NamedTuple):
         for way in self.ways:
             rows = way[(self.ratio[way] > LEAST_RATIO) & np.isfinite(self.phase_deg[way]) & ~self.free[way]]
             behind = self.behind_deg(1.0)[rows]
-            clear = np.abs(behind) > np.maximum(_SURE * self.phase_error_deg[rows], _CLEAR_DEG)
+            # a row is on one side from a degree on, beyond errors
+            clear = np.abs(behind) > np.maximum(_SURE * self.phase_error_deg[rows], 1.0)
             sides = np.sign(behind[clear])
             stretches = np.split(sides, np.flatnonzero(np.diff(sides)) + 1)
             long = [float(part[0]) for part in stretches if len(part) >= _FEWEST]
@@ -238,26 +231,26 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     known_zero = bool(readings.seen_free.any()) or readings.zero is not None
     by_energy = readings.sign_by_energy() if known_zero else None
     # energies of all rows hardly depend on the sign
-    on_resonance = readings.detuning <= _ON_RESONANCE / readings.quality_factor
+    # on resonance |1 - s^2| is at most half of 1/Q
+    on_resonance = readings.detuning <= 0.5 / readings.quality_factor
+    off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
     decided = {
         "stated": SENSES.get(stated),
         "energy": by_energy or None,
         "order": readings.sign_by_order() if on_resonance and known_zero else None,
+        "assumed" if on_resonance else "unknown": -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0,
     }
-    origin = next((name for name, sign in decided.items() if sign is not None), "")
-    sign = decided.get(origin)
-    if sign is None:
-        origin = "assumed" if on_resonance else "unknown"
-        off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
-        sign = -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0
+    # the first that decides
+    origin, sign = next((name, sign) for name, sign in decided.items() if sign is not None)
     zero = float(np.median(readings.zero_deg(sign)))
-    reason, rows = "", readings.giving_energy_away(sign)
+    reason = ""
     if by_energy == 0.0:
         reason = (
             "with either sign of the phase taps would gain energy: frequency, Q, the drive (force or base) or the "
             "phase is wrong"
         )
     elif by_energy is not None and by_energy != sign:
+        rows = readings.giving_energy_away(sign)
         reason = (
             f"the phase was stated to {'lag' if sign > 0.0 else 'lead'}, but then {rows} taps would gain energy, and "
             f"with the other sign they do not: {SENSE_OPTION}"

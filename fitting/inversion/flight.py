@@ -15,8 +15,6 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.predict.orbit import Row, evaluated
 
 _NOTHING = table_of(0.0, EXCESS**2, np.zeros(KNOTS), np.zeros(4))
-_HALF_SINE = 0.42441318157838753
-"""4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
 _STEPS, _ARRIVED = 40, 1e-9
 """Steps of Gauss and Newton, and the last one of a row that has arrived, in their units."""
 
@@ -39,8 +37,8 @@ def invert_rows(
         Approach speed, rebound speed and delay of every row; how they change with independent errors of the readings,
         of unit variance; how with each column of the instrument; and chi2, 0 where only two numbers were read.
     """
-    # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
-    height = np.where(np.isfinite(error[:, 0]), read[:, 0], read[:, 1] / _HALF_SINE)
+    # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi, and the lock-in amplitude 4 a/(3 pi)
+    height = np.where(np.isfinite(error[:, 0]), read[:, 0], 0.75 * np.pi * read[:, 1])
     speed = RAD_PER_US_PER_KHZ * instrument[:, 0] * height
     period = 1e3 * row.order / row.drive_frequency_khz
     zero, u = np.zeros_like(speed), speed

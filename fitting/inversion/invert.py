@@ -22,8 +22,6 @@ Rows = Float[np.ndarray, " rows"]
 Impacts = Float[np.ndarray, "rows 3"]
 Covariances = Float[np.ndarray, "rows 3 3"]
 Shared = Float[np.ndarray, "rows 3 k"]
-_OUTLIER = 16.0
-"""chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _SLOW = 2.5
 """Rows below this multiple of sqrt(epsilon) are left out of the lines: their contact is no short event any more."""
 POWERS = {"viscous": 1, "restitution": 2}
@@ -201,7 +199,8 @@ def invert(
     note = np.full(table.rows, "no phase with an amplitude: nothing to invert", dtype=object)
     note[chosen] = "no flight between two impacts has this amplitude and phase"
     note[rows] = np.where(fast, "", f"slower than {_SLOW} sqrt(epsilon): left out of the lines")
-    for i in rows[chi2[rows] > _OUTLIER]:
+    # four standard errors
+    for i in rows[chi2[rows] > 16.0]:
         note[i] = f"amplitudes and phase contradict each other (chi2 {chi2[i]:.3g} of one degree of freedom)"
     u, w, delay = impact.T
     unsure = table.quality_factor is not None and table.quality_factor_error is None

@@ -28,10 +28,6 @@ _BEYOND = 3.0
 """Standard errors beyond which a pixel is out of range."""
 _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
-_USUAL_ZERO_DEG = 0.2
-"""Standard error of the free tip's phase where it is given without one."""
-_DECIDING = 4096
-"""Pixels that determine the sign of the phase, evenly chosen."""
 _BLOCK = 1 << 16
 """Pixels that are computed at once: more of them leave the processor's cache, and take twice as long."""
 _UNITS = {
@@ -166,8 +162,8 @@ def tapping_map(
             "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
     pixels = np.flatnonzero(measured)
-    # of pixels evenly chosen, the free tip in front
-    some = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), _DECIDING)).astype(int)]
+    # 4096 pixels, evenly chosen, determine the sign of the phase, the free tip in front
+    some = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), 4096)).astype(int)]
     free, free_phase = common["free_amplitude_nm"], common["free_phase_deg"]
     seen = map(np.append, (free.value, free_phase.value), (amplitude.ravel()[some], images.phase_deg.ravel()[some]))
     rows = _rows_of(drive, common, (noise[0], float(np.hypot(noise[1], free_phase.error))), *seen)
@@ -250,7 +246,8 @@ def _with_errors(known: dict[str, Known]) -> dict[str, Given]:
     common = {}
     for key, one in known.items():
         value = float(one.value)
-        usual = _USUAL_ZERO_DEG if key == "free_phase_deg" else _USUAL.get(key, 0.0) * abs(value)
+        # a phase of the free tip is read to 0.2 degrees
+        usual = 0.2 if key == "free_phase_deg" else _USUAL.get(key, 0.0) * abs(value)
         common[key] = Given(value, (one.error or usual) if usual and one.origin != _OVER_IT else 0.0)
     scale = known.get("nm_per_volt")
     if scale is not None and scale.error:

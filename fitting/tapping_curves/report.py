@@ -25,8 +25,6 @@ from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, interpo
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
-QUOTED = 0.8
-"""Amplitude, as a fraction of the free one, at which the first line gives the energy."""
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
     "half": "half of the free amplitude is left",
@@ -76,7 +74,8 @@ def energy_in_words(result: Tapping) -> list[str]:
         return [f"Energy of a tap: at most {result.bound_aj:.3g} aJ{electronvolts}"]
     if top is None or not (result.valid or "only bracketed" in result.why_not_functions):
         return ["Energy of a tap: not known"]
-    quoted = [one for one in result.energies_at if one["amplitude_ratio"] == QUOTED]
+    # the first line gives the energy at 0.8 of the free amplitude
+    quoted = [one for one in result.energies_at if one["amplitude_ratio"] == 0.8]
     places = [(max(quoted, key=lambda one: one["energy_aj"]), "interval95_aj", "Energy of a tap")] if quoted else []
     places.append((top, "interval95", "Largest energy of a tap" if quoted else "Energy of a tap, where it is largest"))
     lines = []
@@ -238,14 +237,11 @@ def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: R
     return write_report_files(folder, name, text=text, data=data, picture=picture, page=page)
 
 
-_OF_CURVES = ("energy_aj", "energy_scatter_aj", "energy_own_error_aj", "energy_common_error_aj")
-
-
 def together_report(result: TappingTogether) -> Report:
     """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
     cells = []
     for one in result.scatter:
-        columns = [getattr(one, name) for name in _OF_CURVES]
+        columns = one.energy_aj, one.energy_scatter_aj, one.energy_own_error_aj, one.energy_common_error_aj
         for ratio in HEADLINE:
             mean, *errors = interpolated(ratio, one.amplitude_ratio, *columns)
             if np.isfinite(mean):

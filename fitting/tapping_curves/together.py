@@ -26,10 +26,6 @@ from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import energies_of_table
 from fitting.tapping_curves.verdict import ORIGINS
 
-_SAME = 0.03
-"""Relative difference of free amplitudes up to which branches of several curves are compared."""
-_POINTS = 41
-
 
 @dataclass(frozen=True, eq=False)
 class CurveScatter(CurveBranch):
@@ -199,10 +195,10 @@ def _scatters(curves: Sequence[Tapping]) -> tuple[CurveScatter, ...]:
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
-    """Say whether two branches are compared: of one frequency, way and side, and nearly one free amplitude."""
+    """Say whether two branches are compared: of one frequency, way and side, and one free amplitude to 3 %."""
     apart = abs(one.free_amplitude_nm - other.free_amplitude_nm)
     return (one.drive_frequency_khz, one.name) == (other.drive_frequency_khz, other.name) and (
-        apart < _SAME * one.free_amplitude_nm
+        apart < 0.03 * one.free_amplitude_nm
     )
 
 
@@ -212,7 +208,7 @@ def _scatter(members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | Non
     if len(members) < 2:
         return None
     ends = [branch.curve.amplitude_ratio[[0, -1]] for _, branch in members]
-    ratio = np.linspace(np.min(ends), np.max(ends), _POINTS)
+    ratio = np.linspace(np.min(ends), np.max(ends), 41)
     columns = np.array([_parts_at(ratio, one, branch) for one, branch in members])
     enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
     ratio, (energy, estimate, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
