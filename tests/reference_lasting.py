@@ -54,9 +54,13 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         kappa = np.clip(g, *PULLS)
         slope, deep, over = (np.polynomial.polynomial.polyval(kappa, row) for row in SERIES)
         longer, depth = 1.0 + kappa * slope / over, deep / over
-        air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8
+        # a bridge, as its lead tells of it, makes the tip faster: in its own length, and in the solid
+        energy = 2.0 * 0.81 * lead / BRIDGE_NM * (approach**2 - free**2) / approach**2
+        air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8 * (1.0 + energy)
         gain = 2.0 * depth * j - 2.0 * air * k.decay * lasting
-        rebound = np.sqrt(np.maximum(free**2 + gain * hit**2, 0.01 * free**2))
+        # the flights' own drag between gap 0 and the surface does not count twice
+        drag = 0.87 * lead * (approach - free) - 0.5 * offset * (approach + free)
+        rebound = np.sqrt(np.maximum(free**2 + gain * hit**2 - 4.0 * k.decay * drag, 0.01 * free**2))
         # to first order in a spring a period is shorter by the energy's slope of its share of the action
         longer = longer - 1.0 - 0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * (DEEPEST / HERTZ_TIME * k.free * lasting) ** 2
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
