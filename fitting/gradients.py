@@ -133,7 +133,11 @@ _TOUCHING = 1e-3
 
 @partial(jax.jit, static_argnames="drive")
 def _touches(
-    x: Float[Array, "rows 3"], approach: Float[Array, " rows"], local: Float[Array, "rows local"], row: Row, drive: str
+    x: Float[Array, "rows 3"],
+    approach: Float[Array, " rows"],
+    local: Float[Array, "rows local"],
+    row: Row,
+    drive: str,
 ) -> Bool[Array, " rows"]:
     """Say of rows whether the flight before the impact touches the platform on the way."""
 
@@ -142,7 +146,8 @@ def _touches(
         arrival, delay = x[1] / platform.angular_frequency, x[2]
         landing = platform.motion(arrival)
         # back from the impact to where the flight begins to count: at max(t_in, t_out)
-        times = (jnp.maximum(delay, 0.0) - row.order * platform.period_us) * jnp.asarray(np.linspace(1.0, 0.0, _LOOKS))
+        longest = row.order * platform.period_us - jnp.maximum(delay, 0.0)
+        times = -longest * jnp.asarray(np.linspace(1.0, 0.0, _LOOKS))
         height, _ = cantilever.propagator(times)(landing.position, landing.velocity - approach)
         gap = height - platform.position(arrival + times)
         before, here, after = gap[:-2], gap[1:-1], gap[2:]

@@ -143,7 +143,8 @@ def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[s
         from fitting.predict.contact import ContactLawModel  # noqa: PLC0415  # for contacts alone
 
         held = tuple(one for one in settings["held"] if one.error > 0.0)
-        return Model(data, ContactLawModel(problem.own, fixed, held, problem.effects, data.mass_ng), instrument, known)
+        law = ContactLawModel(problem.own, fixed, held, problem.effects, data.mass_ng)
+        return Model(data, law, instrument, known)
     own = problem.own
     if problem.lasting and "viscous_loss" not in (*own, *fixed):
         own = (*own, "viscous_loss")
@@ -202,6 +203,7 @@ def minimum_of(model: Model, *, robust: bool = False) -> Fitted:
     if model.law.lasting:
         explained, before = fit_lasting(model, robust=robust)
         steps = OPTIMISER + ", then Levenberg-Marquardt"
-        return Fitted(explained, before, None, Explained.profile, convergence_of(explained, steps, explained.end.steps))
+        convergence = convergence_of(explained, steps, explained.end.steps)
+        return Fitted(explained, before, None, Explained.profile, convergence)
     explained, best, other = fit_instantaneous(model, robust=robust)
     return Fitted(explained, explained, other, profile, convergence_of(explained, OPTIMISER, best.steps))

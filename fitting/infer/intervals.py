@@ -80,7 +80,12 @@ def _with_open_ends(parameter: Parameter, ends: list[float | None], reasons: lis
     return Interval(ends[0], ends[1], "; ".join(said) or None, "limit" if None in ends else kind)
 
 
-def _end(rise: Callable[[float], float], unknown: Unknown, side: float, most: float) -> tuple[float | None, str | None]:
+def _end(
+    rise: Callable[[float], float],
+    unknown: Unknown,
+    side: float,
+    most: float,
+) -> tuple[float | None, str | None]:
     """Return how far one end is, or why there is none: where sqrt(rise), nearly linear in the distance, is 1.96."""
     error = unknown.error
     wanted = float(np.sqrt(CHI2_95))
