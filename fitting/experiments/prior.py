@@ -210,7 +210,8 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
     law, valid = payload.get("law"), payload["valid"]
-    note = f"The fit that the design rests on is not valid: {' '.join(payload.get('reasons') or ['no reason given.'])}"
+    reasons = " ".join(payload.get("reasons") or ["no reason given."])
+    note = f"The fit that the design rests on is not valid: {reasons}"
     return Prior(
         problem=problem,
         values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),

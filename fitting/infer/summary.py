@@ -265,7 +265,8 @@ def _parameters(task: Task, closest: Closest, intervals: list[Interval] | None) 
     for i, (name, error) in enumerate(zip(closest.names, closest.errors.tolist(), strict=True)):
         interval = unexplained if intervals is None else intervals[i]
         # of a contact's parameter that may be 0 for all the data say, the other end is a limit
-        vanishes = closest.vanishes[i] or (name in CONTACT_NAMES and interval.low is None and interval.high is not None)
+        only_below = interval.low is None and interval.high is not None
+        vanishes = closest.vanishes[i] or (name in CONTACT_NAMES and only_below)
         parameters[name] = FittedParameter(
             value=float(closest.values[i]),
             unit=parameter_called(name).unit,
