@@ -266,7 +266,7 @@ def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         while not (child := children.read_text(encoding="ascii").split()[:1]) and time.monotonic() < deadline:
             time.sleep(0.05)
-        time.sleep(2.0)
+        time.sleep(6.0)
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130
