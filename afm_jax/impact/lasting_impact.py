@@ -133,7 +133,7 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     # contact begins at the solid's surface, which the tip reaches from gap 0 under the pull
     at_surface = speed_over(u, raised, pull)
     tau = hertz.time(at_surface)
-    lead, (_, deeper) = jnp.maximum(hertz.lead_nm, 0.0), in_bridge(hertz, u, w)
+    lead, (_, deeper) = hertz.lead_nm, in_bridge(hertz, u, w)
     gained, longer = gained_and_longer(at_surface, tau, middle, cantilever, deeper)
     # the air of the flights counts to gap 0, and in the bridge the tip is faster than there
     gained = gained + 4.0 * cantilever.decay_rate * (raised * (u + w) - IN_AIR * lead * (u - w))
@@ -261,7 +261,7 @@ def in_bridge(
         approach_speed: u in nm/us.
         rebound_speed: w in nm/us.
     """
-    lead, length = jnp.maximum(hertz.lead_nm, 0.0), hertz.length_nm
+    lead, length = hertz.lead_nm, hertz.length_nm
     drawn = BELOW * length * lead * (1.0 / rebound_speed - 1.0 / approach_speed)
     return drawn, FASTER * lead / length * (1.0 - (rebound_speed / approach_speed) ** 2)
 
