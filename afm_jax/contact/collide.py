@@ -447,14 +447,15 @@ class Collisions(NamedTuple):
         }
         title = "Collisions of a free tip with the sample at rest"
         names = [CollisionOutcome(end).name.lower().replace("_", " ") for end in self.tips.outcome.tolist()]
-        rows = rows_of(self.columns | {"outcome_name": names})
+        columns = self.columns
+        rows = rows_of(columns | {"outcome_name": names})
         parts: list[str | Table] = [printed_table(title, cells, rows[:_MOST_PRINTED])]
         if len(rows) > _MOST_PRINTED:
             which = f"The first {_MOST_PRINTED} of {len(rows)} collisions"
             parts.append(f"{which}; the JSON object and collide.csv have all.")
-        parts += sorted(set(self.columns["outcome"]))
+        parts += sorted(set(columns["outcome"]))
         capture, junction = self.capture_speed_nm_per_us, self.junction
-        if all(self.columns["captured"]):
+        if all(columns["captured"]):
             parts.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
         parts.append(self.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
         parts.append(

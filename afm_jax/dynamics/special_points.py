@@ -155,13 +155,12 @@ def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
         if curve.ends[end] != "lost":
             continue
         last, position = steps[-1], float(end * len(curve.legs))
-        # it is extrapolated over this length
+        # far enough to extrapolate from
         far = (step for step in reversed(steps) if np.linalg.norm(step.point - last.point) > 1e-5)
         before = next(far, steps[0])
         for test in (GRAZING, CAPTURE):
             left, earlier = float(last.tests[test]), float(before.tests[test])
-            # infinite where no flight has a lowest point
-            # of a test function at whose root the curve was lost
+            # the curve was lost at a root; a test is infinite where no flight has a lowest point
             if 0.0 <= left < 1e-3 and left < earlier:
                 ahead = left / (earlier - left) * (last.point - before.point)
                 roots.append(_Root(position, test, last._replace(point=last.point + ahead), [last.point]))

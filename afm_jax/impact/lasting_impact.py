@@ -129,11 +129,11 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     """
     u, w = free.approach, free.rebound
     pull, hertz = middle.acceleration, impact.hertz_contact
-    raised, length = hertz.raised_nm, hertz.length_nm
+    raised, length, lead = hertz.raised_nm, hertz.length_nm, hertz.lead_nm
     # contact begins at the solid's surface, which the tip reaches from gap 0 under the pull
     at_surface = speed_over(u, raised, pull)
     tau = hertz.time(at_surface)
-    lead, (_, deeper) = hertz.lead_nm, in_bridge(hertz, u, w)
+    _, deeper = in_bridge(hertz, u, w)
     gained, longer = gained_and_longer(at_surface, tau, middle, cantilever, deeper)
     # the air of the flights counts to gap 0, and in the bridge the tip is faster than there
     gained = gained + 4.0 * cantilever.decay_rate * (raised * (u + w) - IN_AIR * lead * (u - w))
