@@ -3,6 +3,7 @@
 from itertools import product
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
+from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
@@ -267,3 +269,21 @@ def test_a_diagram_begins_where_there_is_motion_or_where_it_is_told_to():
     at_rest = bifurcation_diagram(scene, "platform.offset_nm", values, start=(0.0, 1.0, 0.0), impacts=600)
     assert at_rest.verdicts.names() == ["stuck"] * 3
     assert at_rest.restarted.tolist() == [False, True, True]
+
+
+@pytest.mark.slow
+def test_jacobian_trace_and_determinant_are_those_of_automatic_differentiation():
+    scene = driven("force", INSTANT, 1.03, 60.0, -40.0, 200.0)
+    found = single_impact_orbits(scene, 1)
+    slot = fastest(found)
+    start = started(scene, found, slot)
+    at = jnp.stack([start.time_us, start.velocity_nm_per_us])
+
+    def after(state):
+        impact = next_impact(scene, *state)
+        return jnp.stack([impact.time_us, impact.velocity_after_nm_per_us])
+
+    jacobian = np.asarray(map_jacobian(scene, *at))
+    np.testing.assert_allclose(jacobian, jax.jacfwd(after)(at), rtol=1e-9)
+    assert np.trace(jacobian) == pytest.approx(float(found.trace[slot]), rel=1e-9)
+    assert np.linalg.det(jacobian) == pytest.approx(float(found.determinant[slot]), rel=1e-9)

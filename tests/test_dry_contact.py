@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import cumulative_trapezoid, quad, solve_ivp
 
-from afm_jax import Cantilever, Platform, Scene, capture_speed, collide, find_junction, make_law
+from afm_jax import Cantilever, Platform, Scene, capture_speed, collide, find_junction, make_law, simulate, trajectory
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces import Dmt, Hertz, VanDerWaals, Viscous
+from afm_jax.motion.record import MotionOutcome
+from afm_jax.motion.start import default_start
 from afm_jax.outcomes import CollisionOutcome
 from fitting import law_of_contact
 
@@ -133,3 +135,26 @@ def test_law_of_a_dry_contact_gives_back_the_speed():
 
 
 SCENE = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), Contact(VanDerWaals() + Viscous(), Dmt()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contact", [SCENE.interaction, Contact((), Hertz())], ids=["dmt", "hertz"])
+def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(contact):
+    scene = Scene(SCENE.cantilever, SCENE.platform, contact)
+    simulation = simulate(scene, default_start(scene), 4.5 * float(SCENE.platform.period_us), max_contacts=16)
+    assert int(simulation.outcome) == MotionOutcome.FINISHED
+    rows = simulation.contacts
+    assert rows.detail is not None
+    approach, rebound = float(rows.approach_speed_nm_per_us[1]), float(rows.rebound_speed_nm_per_us[1])
+    free = collide(contact, approach)
+    # drive and spring change the speeds during the contact by what they do in its duration
+    assert rebound == pytest.approx(float(free.rebound_speed_nm_per_us), rel=0.02)
+    assert int(rows.detail.junctions[1]) == 1
+    assert float(rows.energy_lost_aj[1]) == pytest.approx(float(free.viscous_loss_aj), rel=0.02, abs=1e-9)
+    times = np.linspace(float(rows.arrival_time_us[1]), float(rows.departure_time_us[1]), 513)
+    path = trajectory(scene, simulation, times)
+    assert path.gap_nm.min() == pytest.approx(float(rows.detail.deepest_gap_nm[1]), rel=1e-3)
+    assert path.gap_nm[-1] == pytest.approx(float(contact.bridge_breaks_nm), abs=1e-6)
+    moved = cumulative_trapezoid(path.gap_rate_nm_per_us, times, initial=0.0)
+    # the trapezoidal rule's error, from the acceleration's jump where the solids meet
+    np.testing.assert_allclose(path.gap_nm, path.gap_nm[0] + moved, atol=2e-3)
