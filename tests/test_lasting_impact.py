@@ -186,7 +186,8 @@ def test_depth_and_loss_by_the_air_are_those_of_the_course_through_bridge_and_so
         path = CubicHermiteSpline(time, gap, course.velocity_nm_per_us[later])
         u, w, first, last = float(speed), float(speeds.rebound), gap[0], gap[-1]
         deep = 0.5 * first**2 / u + 0.5 * last**2 / w - path.integrate(time[0], time[-1])
-        assert float(depth_of_impact(impact, *speeds[:2], around(0.0), UNDAMPED, 0.0)) == pytest.approx(deep, rel=0.06)
+        depth = depth_of_impact(impact, speeds.approach, speeds.rebound, around(0.0), UNDAMPED, 0.0)
+        assert float(depth) == pytest.approx(deep, rel=0.06)
         # d(v^2)/dt = -4 gamma v^2, gamma = Omega/2Q; the straight paths lose theirs in flight
         dense = np.linspace(time[0], time[-1], 40001)
         squared = np.trapezoid(path(dense, 1) ** 2, dense) - u * first - w * last
