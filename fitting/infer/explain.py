@@ -264,7 +264,7 @@ def run_of_residuals(explained: Explained) -> float:
     """
     orbits, end, weights = explained.end.orbits, explained.end, explained.weights
     seen = weights.used.any(axis=1) & np.isfinite(orbits.approach) & ~explained.model.data.row.free
-    if not seen.any():
+    if not (seen.any() and np.isfinite(end.chi2)):
         return 0.0
     u = np.where(seen, orbits.approach, 1.0)
     place = np.log(u)
