@@ -1,4 +1,4 @@
-"""An oscillator in its own units: COCO's impact oscillator, and where its free motion grazes the stop."""
+"""An oscillator in its own units, against results of others: COCO, Budd and Dux, Simpson and Ghosh."""
 
 import re
 from pathlib import Path
@@ -66,3 +66,39 @@ def test_free_motion_grazes_where_its_amplitude_is_the_gap(omega: float):
 def test_impossible_numbers_are_named(name: str, value: float):
     with pytest.raises(ValueError, match=f"`{name}` must"):
         dimensionless_scene(**{"omega": 1.0, "damping_ratio": 0.05, "r": 0.8, "gap": 1.0, name: value})
+
+
+def undamped_speeds(omega: float, r: float, order: int, stop: float) -> list[float]:
+    """Return impact speeds of one impact in so many periods without damping, admissible or not, and where they fold.
+
+    Budd and Dux, Nonlinearity 7, 1191 (1994); `OneNParams` of github.com/FelixDux/impact-oscillator. Force 1.
+    """
+    period, gamma, lost = 2.0 * np.pi * order / omega, 1.0 / (1.0 - omega**2), (1.0 - r) / omega
+    turned = (1.0 + r) * np.sin(period) / (1.0 - np.cos(period))
+    root = 2.0 * np.sqrt(complex((gamma * turned) ** 2 - (stop**2 - gamma**2) * lost**2))
+    both = (-2.0 * turned * stop + np.array([-root, root])) / (turned**2 + lost**2)
+    return [float(speed.real) for speed in both if speed.imag == 0.0 and speed.real > 0.0]
+
+
+@pytest.mark.parametrize(("stop", "admissible"), [(0.0, 1), (0.2, 2), (-0.06, 0), (0.4, 0)])
+def test_undamped_impact_speeds_are_those_of_budd_and_dux(stop: float, admissible: int):
+    orbits = single_impact_orbits(dimensionless_scene(3.7, 0.0, 0.8, gap=stop), 2)
+    speeds = np.asarray(orbits.approach_speed_nm_per_us)[np.asarray(orbits.exists)]
+    np.testing.assert_allclose(np.sort(speeds), undamped_speeds(3.7, 0.8, 2, stop), rtol=1e-12)
+    # the counts are those of the program's own tests
+    assert np.asarray(orbits.admissible).sum() == admissible
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "away"), [("fold", -0.01), ("period_doubling", 0.04)])
+def test_at_resonance_folds_and_doublings_leave_grazing_quadratically(kind: str, away: float):
+    """Simpson and Ghosh, arXiv 2602.22797: tangent where the force has twice the damped natural frequency."""
+    beyond = []
+    for far in (away, 0.5 * away):
+        omega = 2.0 * np.sqrt(1.0 - 0.05**2) + far
+        grazing = np.hypot(1.0 - omega**2, 0.1 * omega)
+        scene = dimensionless_scene(omega, 0.05, 0.8, gap=1.0)
+        found = continue_orbits(scene, 1, ParameterRange("force.amplitude_nn", 0.95 * grazing, 1.05 * grazing))
+        (point,) = [point for point in found.special if point.kind == kind]
+        beyond.append(point.parameter - grazing)
+    assert np.log2(beyond[0] / beyond[1]) == pytest.approx(2.0, abs=0.05)
