@@ -133,12 +133,6 @@ def with_units_in_names(sign: str, decimal: str) -> str:
     return separated({"Z [um]": 1e-3 * offset, "Amp (nm)": amplitude, "Phase/rad": np.deg2rad(lag)}, sign, decimal)
 
 
-def with_words() -> str:
-    """Return approach and retract, told apart by a column of words."""
-    head, *rows = with_units_in_names(",", ".").splitlines()
-    return "\n".join([f"{head},Branch", *(f"{row},{word}" for word in ("approach", "retract") for row in rows)]) + "\n"
-
-
 def without_names(separator: str) -> str:
     decimal = "." if separator.strip() == "," else ","
     rows = zip(*tapping_rows(), strict=True)
@@ -160,7 +154,6 @@ SIDE_BY_SIDE = {"columns": BRUKER, "nm_per_volt": 50.0}
         (bruker_ramp, SIDE_BY_SIDE, {"rtol": 0.0, "atol": 1e-4}, 1e-4),
         (partial(with_units_in_names, "\t", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (partial(with_units_in_names, ";", ","), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
-        (with_words, {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         # decimal commas are told from commas that separate
         *((partial(without_names, sign), NUMBERS, {"rtol": 0.0, "atol": 1e-4}, 1e-4) for sign in (" ", ", ")),
     ],
@@ -169,7 +162,7 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
     offset, amplitude, lag = tapping_rows()
     curve = read_curve(saved(tmp_path, write()), **options)
     assert int(np.sum(curve.branch == "approach")) == 120
-    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, bruker_ramp, with_words) else 120)
+    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, bruker_ramp) else 120)
     np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, **precision)
     np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=degrees)
     np.testing.assert_allclose(np.diff(curve.offset_nm[:120]), np.diff(offset), atol=1e-2)

@@ -382,14 +382,14 @@ def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
 
 def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     """Return the weighted mean of the branches' slopes, its error widened by what they differ beyond theirs."""
-    slopes = np.array([[look.slope.value, look.slope.error] for look in looks.values() if look.slope is not None])
+    slopes = np.array([look.slope[:3] for look in looks.values() if look.slope is not None])
     if not slopes.size:
         return None
     # rows that lie on a line exactly leave no error at all
     weights = np.maximum(slopes[:, 1], 1e-9 * np.abs(slopes[:, 0])) ** -2.0
-    mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
+    mean, bend = np.average(slopes[:, [0, 2]], axis=0, weights=weights).tolist()
     chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
-    return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
+    return mean, float(np.hypot(np.sqrt(max(chi2, 1.0) / weights.sum()), bend))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
@@ -555,8 +555,6 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
     calibration = {key: (0.0, errors[key]) for key in ("offset_origin_nm", "phase_zero_deg") if key in errors}
     if "nm_per_volt" in errors:
         calibration["tip_calibration"] = (1.0, errors["nm_per_volt"] / float(known["nm_per_volt"].value))
-    if "phase_zero_deg" in errors:
-        remarks.append(zero_of_free_rows(errors["phase_zero_deg"]))
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         header["phase_sense"] = "lag" if "phase_sense" in known else "either"
@@ -571,11 +569,6 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
         source=curve.source,
         remarks=tuple(remarks),
     )
-
-
-def zero_of_free_rows(error: float) -> str:
-    """Return the remark that a zero of the phase with this error is that of the free rows, and no knowledge besides."""
-    return f"phase_zero_deg +- {error!r} is that of the free rows, as frequency and Q leave it"
 
 
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:

@@ -8,7 +8,7 @@ import io
 import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,9 +41,6 @@ from fitting.tables.csv_text import (
     split_lines,
     text_of,
 )
-
-_WAYS = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
-_WAYS |= {"retract": "retract", "bwd": "retract", "backward": "retract"}
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -97,23 +94,22 @@ def parse_text(data: bytes, name: str) -> Recording:
     head = [line for number, line in rows if number < start] or [comment for _, comment in comments]
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]
     header = {pair[0]: re.sub(r"^(\[.*?\])\s*(.*?)\s*$", r"\2 \1", pair[1]) for pair in pairs if len(pair) == 2}
-    columns, units, ways = _columns([row for row in rows if row[0] > start], name)
+    columns, units = _columns([row for row in rows if row[0] > start], name)
+    count = len(next(iter(columns.values()), ()))
     kind, away, remarks = ("Nanonis text", ("Z rel", "Z"), ()) if start else ("separated text", (), ())
-    runs = np.zeros(len(ways))
+    runs = np.zeros(count)
     if any("neaspec" in comment.lower() for _, comment in comments):
         kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
         remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
-        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [len(ways)]
+        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [count]
         declared = int(np.prod([int(pixel) for pixel in pixels[:3]]))
-        if len(ways) % max(declared, 1) or len(ways) < declared:
-            raise cut_off(name, f"the header announces {declared} rows, but {len(ways)} are there")
+        if count % max(declared, 1) or count < declared:
+            raise cut_off(name, f"the header announces {declared} rows, but {count} are there")
         columns = {title: numbers for title, numbers in columns.items() if re.fullmatch(r"Z|[MO]\d[AP]", title)}
         units = {title: {"Z": "m", "A": "nm", "P": "rad"}[title[-1]] for title in columns}
     segments = [
-        Segment(number, way, {title: numbers[rows_of_it] for title, numbers in columns.items()})
+        Segment(number, "", {title: numbers[runs == run] for title, numbers in columns.items()})
         for number, run in enumerate(dict.fromkeys(runs.tolist()), start=1)
-        for way in dict.fromkeys(ways)
-        if (rows_of_it := (runs == run) & (np.array(ways) == way)).any()
     ]
     back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
     if back:
@@ -123,8 +119,8 @@ def parse_text(data: bytes, name: str) -> Recording:
     return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
 
 
-def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str], list[str]]:
-    """Return the columns below a row of names (NaN where a cell holds no number), their units, and the way of each row.
+def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return the columns below a row of names (NaN where a cell holds no number), and their units.
 
     Raises:
         TableError: if a row has another number of cells than the first.
@@ -154,9 +150,7 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
     numbers = numbers.reshape(len(body), len(titles))
     columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
-    place = next((k for k, title in enumerate(titles) if title.lower() in {"branch", "direction", "segment"}), None)
-    ways = [""] * len(body) if place is None else [_WAYS.get(cells[place].lower(), "") for cells in body]
-    return columns, units, ways if all(ways) else [""] * len(body)
+    return columns, units
 
 
 def _name_and_unit(text: str) -> tuple[str, str]:
@@ -302,7 +296,10 @@ def parse_igor(data: bytes, name: str) -> Recording:
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
     side = numbers.ndim - 1
-    labels = _igor_labels(data, wave["bin_header"], min(side, 2))
+    # a text of UTF-8 since version 7 of Igor, whose field has rests of earlier ones behind the NUL
+    fields = wave["labels"][min(side, 2)][1:] if "labels" in wave else []
+    texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
+    labels = [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
     if side not in {1, 2} or len(labels) != numbers.shape[side]:
         raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
     header = _settings(bytes(wave["note"]), ":")
@@ -332,21 +329,6 @@ def parse_igor(data: bytes, name: str) -> Recording:
     whole = (Segment(1, "", columns),) if side == 2 or not segments else tuple(segments)
     kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
     return Recording(kind, name, whole, units, known, settings=header, size_m=size)
-
-
-def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
-    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
-
-    What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
-    """
-    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
-    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
-    # behind a header of 64 bytes; version 5 is the only one with labels
-    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
-    fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
-    # UTF-8 since version 7 of Igor
-    texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
-    return [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
 
 
 def _igor_points(data: bytes) -> int:

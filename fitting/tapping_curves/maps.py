@@ -126,8 +126,7 @@ def tapping_map(
     """Return energy and virial of a tap in every pixel of an image of amplitude and phase.
 
     Args:
-        images: a file for `read_images`, a pair of files, what that returned, or the arrays of amplitude in nm and
-            phase in degrees.
+        images: a file for `read_images`, what that returned, or the arrays of amplitude in nm and phase in degrees.
         columns: which channel is which, as for `read_images`, where `images` does not come from there.
         drive: what shakes the cantilever.
         phase_sense: whether the phase grows as the tip lags more, or falls; None: the energies decide where they can.

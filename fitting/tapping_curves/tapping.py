@@ -9,7 +9,6 @@ from afm_jax.checks import checked, in_float64
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
 from afm_jax.words import printable
-from fitting.instruments.curve import zero_of_free_rows
 from fitting.instruments.lag import PhaseReadings, sense_of_phase, turned
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
@@ -48,8 +47,6 @@ from fitting.tapping_curves.result import Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
 LAW_MODEL = "viscous+delay"
-_FEWEST_TO_FOLLOW = 8
-"""Rows from which a drift along them is looked for."""
 _ORIGIN_NM = 0.3
 """What the height's origin is uncertain by where the table does not say."""
 
@@ -104,7 +101,7 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         TableError: as `tapping`.
     """
     curve = with_sense_of_phase(curve_of(table), table.phase_sense)
-    curve = _with_zero_of_free_rows(curve, table.remarks)
+    curve = _with_zero_of_free_rows(curve)
     if curve.phase.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
         frequency = curve.free_frequency_khz
@@ -122,15 +119,11 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
     alike = touching & ~early & ~functions.outliers, repulsive, functions.smooth
-    fit, with_drifts, used = one_energy(lever, *alike), None, np.zeros(curve.rows, bool)
+    fit, used = one_energy(lever, *alike), np.zeros(curve.rows, bool)
     if fit is not None:
         used, scale = fit.used, np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
         if scale_errors and scale > 1.0:
             fit = one_energy(lever, *alike, float(scale))
-        if curve.time is None and used.sum() >= _FEWEST_TO_FOLLOW:
-            # with drifts, as if the rows stood in the order of time
-            in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-            with_drifts = one_energy(Lever([in_order], [free]), *alike)
     silent = np.isnan(curve.lag_deg)
     alone = touching & ~used & ~np.isin(np.arange(curve.rows), np.concatenate([np.zeros(0, int), *stretches]))
     # why a row is not in the fit, or what it is for: the first that holds
@@ -159,7 +152,6 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         fit=fit,
         functions=functions,
         scale_errors=scale_errors,
-        fit_with_drifts=with_drifts,
         bound_aj=None if curve.has_phase else _bound(curve, rows.largest_energy_aj[~free & ~held]),
         hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None if fit is None else speeds(functions, used),
@@ -326,11 +318,11 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
         )
 
 
-def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> TappingCurve:
+def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
     """Return a curve whose zero of the phase is that of its free rows, if the statements determine it no better.
 
     A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
-    given, and says so: taken for knowledge besides, it would count both twice.
+    given, with an error at least as large as theirs: taken for knowledge besides, it would count both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
     if stated is None or free.sum() < FEWEST_FREE_ROWS:
@@ -339,8 +331,7 @@ def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> Ta
     start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
     moved = [Instrument(sum(frequency), quality.value), Instrument(frequency.value, sum(quality))]
     of_lag = np.linalg.norm([np.median(lag_of_free_tip(curve, at)[free] - start) for at in moved])
-    own = zero_of_free_rows(stated.error) in remarks or not stated.error < of_lag
-    return replace(curve, phase_zero_deg=None) if own else curve
+    return curve if stated.error < 0.9 * of_lag else replace(curve, phase_zero_deg=None)
 
 
 def _check_range(curve: TappingCurve, zero: float) -> None:
