@@ -213,7 +213,7 @@ def _straight_from(offset: Rows, values: Rows, first: int) -> int:
 
 
 def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:
-    """Return how much the slope of a parabola changes along rows, and the standard error; 0 of less than six heights."""
+    """Return how much a parabola's slope changes along rows, and the standard error; 0 of less than six heights."""
     if len(np.unique(offset)) < 6:
         return 0.0, 0.0
     width = float(np.ptp(offset))
