@@ -41,6 +41,7 @@ class AmplitudeAndPhase(NamedTuple):
         amplitude: in nm or V, shape (rows, columns).
         in_volts: whether it is in V.
         phase_deg: as the instrument counts it.
+        sense: 1 or -1 where a factor of the phase states that it lags or leads, else 0.
         known: what the file says.
         size_m: height and width, or None.
         note: which channels were taken.
@@ -50,6 +51,7 @@ class AmplitudeAndPhase(NamedTuple):
     amplitude: Float[np.ndarray, "rows columns"]
     in_volts: bool
     phase_deg: Float[np.ndarray, "rows columns"]
+    sense: float
     known: dict[str, Known]
     size_m: tuple[float, float] | None
     note: str
@@ -61,7 +63,8 @@ def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> Amp
     Args:
         path: NumPy .npz or .npy, Asylum .ibw or any format that Gwyddion reads; or the arrays of amplitude in nm and
             phase in degrees, the channels `amplitude` and `phase`.
-        columns: which channel is which, as for `read_curves`.
+        columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
+            leads.
 
     Raises:
         TableError: one line: the file is damaged, of no known format or of another mode, has no such channel, or the
@@ -76,7 +79,7 @@ def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> Amp
     wanted = parse_columns(columns)
     taken = {role: needed_channel(images, role, wanted, _ROLES) for role in _ROLES}
     amplitude, phase = (
-        np.asarray(images.segments[0].channels[one.channel], float) * ((one.factor or 1.0) * UNITS[one.unit][1])
+        np.asarray(images.segments[0].channels[one.channel], float) * (abs(one.factor or 1.0) * UNITS[one.unit][1])
         for one in taken.values()
     )
     if amplitude.shape != phase.shape or amplitude.ndim != 2:
@@ -89,6 +92,7 @@ def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> Amp
         amplitude=amplitude,
         in_volts=UNITS[taken["lockin_amplitude_nm"].unit][0] == "voltage",
         phase_deg=phase,
+        sense=float(np.sign(taken["phase_lag_deg"].factor or 0.0)),
         known=dict(images.known),
         size_m=images.size_m,
         note=f"Channels: {', '.join(f'{r} is {s.channel!r} in {s.unit}' for r, s in taken.items())}.",

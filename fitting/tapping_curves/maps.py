@@ -167,7 +167,7 @@ def tapping_map(
     seen = map(np.append, (free.value, free_phase.value), (amplitude.ravel()[some], images.phase_deg.ravel()[some]))
     rows = _rows_of(drive, common, (noise[0], float(np.hypot(noise[1], free_phase.error))), *seen)
     readings = phase_readings(rows, np.arange(rows.rows) == 0)
-    sense = sense_of_phase(readings, phase_sense or "")
+    sense = sense_of_phase(readings, phase_sense or {1.0: "lag", -1.0: "lead"}.get(images.sense, ""))
     notes += sense.notes
     if sense.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
