@@ -8,7 +8,7 @@ import io
 import logging
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -250,8 +250,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
         if frame in branches:
             axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"])
             units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
-            for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
-                parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers
+            points, bits = int(keys["Points"]), int(keys["SaveBits"])
+            whole = np.frombuffer(data[end - size : end], {16: "<i2", 32: "<i4"}[bits]).reshape(-1, points)
+            scaled = (whole / 2.0**bits + 0.5) * float(keys["Dim2Range"]) + float(keys["Dim2Min"])
+            for line, numbers in enumerate(scaled):
+                own = [keys.get(f"LineDim{line}{what}", keys.get(f"Dim0{what}")) for what in ("Min", "Range")]
+                used = min(int(keys.get(f"LineDim{line}Points", points)), points)
+                low, width = (float(value or "nan") for value in own)
+                at = low + width * np.arange(used) / max(used - 1, 1)
+                parts.setdefault((line + 1, branches[frame]), {axis: at})[channel] = numbers[:used].copy()
     if not parts:
         mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
         raise TableError(f"{name}: holds no curve and no spectrum; {mend}")
@@ -262,18 +269,6 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
         known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
-
-
-def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Give the axis and the numbers of every line of a data set."""
-    points, bits = int(keys["Points"]), int(keys["SaveBits"])
-    whole = np.frombuffer(data, {16: "<i2", 32: "<i4"}[bits]).reshape(-1, points)
-    scaled = (whole / 2.0**bits + 0.5) * float(keys["Dim2Range"]) + float(keys["Dim2Min"])
-    for line, numbers in enumerate(scaled):
-        own = [keys.get(f"LineDim{line}{what}", keys.get(f"Dim0{what}")) for what in ("Min", "Range")]
-        used = min(int(keys.get(f"LineDim{line}Points", points)), points)
-        low, width = (float(value or "nan") for value in own)
-        yield low + width * np.arange(used) / max(used - 1, 1), numbers[:used].copy()
 
 
 # ---- Igor
@@ -296,10 +291,7 @@ def parse_igor(data: bytes, name: str) -> Recording:
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
     side = numbers.ndim - 1
-    # a text of UTF-8 since version 7 of Igor, whose field has rests of earlier ones behind the NUL
-    fields = wave["labels"][min(side, 2)][1:] if "labels" in wave else []
-    texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
-    labels = [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
+    labels = _igor_labels(data, wave["bin_header"], min(side, 2))
     if side not in {1, 2} or len(labels) != numbers.shape[side]:
         raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
     header = _settings(bytes(wave["note"]), ":")
@@ -329,6 +321,21 @@ def parse_igor(data: bytes, name: str) -> Recording:
     whole = (Segment(1, "", columns),) if side == 2 or not segments else tuple(segments)
     kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
     return Recording(kind, name, whole, units, known, settings=header, size_m=size)
+
+
+def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
+    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
+
+    What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
+    """
+    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
+    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
+    # behind a header of 64 bytes; version 5 is the only one with labels
+    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
+    fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
+    # UTF-8 since version 7 of Igor
+    texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
+    return [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
 
 
 def _igor_points(data: bytes) -> int:

@@ -170,6 +170,22 @@ def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Kn
     return found
 
 
+UNIT_OF = {
+    "drive_frequency_khz": "kHz",
+    "free_frequency_khz": "kHz",
+    "quality_factor": "",
+    "spring_constant_n_per_m": "N/m",
+    "free_amplitude_nm": "nm",
+    "free_phase_deg": "deg",
+    "nm_per_volt": "nm/V",
+    "tip_calibration": "",
+    "offset_origin_nm": "nm",
+    "amplitude_error_nm": "nm",
+    "phase_error_deg": "deg",
+}
+"""Numbers of lever, drive and instrument that a caller may give, with their units."""
+
+
 def given_numbers(
     numbers: Mapping[str, Any], units: Mapping[str, str], *, any_sign: Sequence[str] = ()
 ) -> dict[str, Known]:

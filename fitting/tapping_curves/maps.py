@@ -18,7 +18,7 @@ from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, words_of
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of_phase, turned
-from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
+from fitting.instruments.recording import ASSUMED_RESONANCE, UNIT_OF, Known, given_numbers
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, phase_readings
@@ -31,14 +31,9 @@ _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 _BLOCK = 1 << 16
 """Pixels that are computed at once: more of them leave the processor's cache, and take twice as long."""
 _UNITS = {
-    "free_frequency_khz": "kHz",
-    "drive_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "free_phase_deg": "deg",
-    "nm_per_volt": "nm/V",
-    "tip_calibration": "",
+    key: unit
+    for key, unit in UNIT_OF.items()
+    if key not in {"offset_origin_nm", "amplitude_error_nm", "phase_error_deg"}
 }
 _OVER_IT = "not known: energies are over it, in nm^2"
 _NEEDED = {"free_frequency_khz": "KHZ", "quality_factor": "Q", "free_amplitude_nm": "NM", "free_phase_deg": "DEGREES"}

@@ -300,21 +300,17 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
     Raises:
         TableError: if it is in radians, or not off by right angles though its zero is stated.
     """
-    seen, name = readings.seen_free, printable(curve.source)
+    seen = readings.seen_free
     if not seen.any():
         return
-    stated = curve.phase_zero_deg.value if curve.phase_zero_deg else 0.0
-    middle = float(np.median(curve.lag_deg[seen] - stated))
-    wanted = float(np.median(readings.free_lag_deg[seen]))
-    if np.nanmax(np.abs(curve.lag_deg)) < 2.0 * np.pi and abs(np.rad2deg(abs(middle)) - wanted) < _OFF_DEG:
-        raise TableError(
-            f"{name}: phase_lag_deg is {middle:.3g} where the tip is free and lags by {wanted:.1f} degrees: write "
-            "degrees, not radians"
-        )
+    readings.refuse_radians(curve.source, "write degrees")
     if curve.phase_zero_deg is not None and abs(off - 90.0 * round(off / 90.0)) > _BEYOND_DEG:
+        middle = float(np.median(curve.lag_deg[seen])) - curve.phase_zero_deg.value
+        wanted = float(np.median(readings.free_lag_deg[seen]))
         raise TableError(
-            f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
-            "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
+            f"{printable(curve.source)}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: "
+            "out of the range of '# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the "
+            "phase"
         )
 
 
