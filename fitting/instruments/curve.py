@@ -539,6 +539,8 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
     calibration = {key: (0.0, errors[key]) for key in ("offset_origin_nm", "phase_zero_deg") if key in errors}
     if "nm_per_volt" in errors:
         calibration["tip_calibration"] = (1.0, errors["nm_per_volt"] / float(known["nm_per_volt"].value))
+    if "phase_zero_deg" in errors:
+        remarks.append(zero_of_free_rows(errors["phase_zero_deg"]))
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         header["phase_sense"] = "lag" if "phase_sense" in known else "either"
@@ -553,6 +555,11 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
         source=curve.source,
         remarks=tuple(remarks),
     )
+
+
+def zero_of_free_rows(error: float) -> str:
+    """Return the remark that a zero of the phase with this error is that of the free rows, and no knowledge besides."""
+    return f"phase_zero_deg +- {error!r} is that of the free rows, as frequency and Q leave it"
 
 
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:

@@ -9,6 +9,7 @@ from afm_jax.checks import checked, in_float64
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
 from afm_jax.words import printable
+from fitting.instruments.curve import zero_of_free_rows
 from fitting.instruments.lag import PhaseReadings, sense_of_phase, turned
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
@@ -101,7 +102,7 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         TableError: as `tapping`.
     """
     curve = with_sense_of_phase(curve_of(table), table.phase_sense)
-    curve = _with_zero_of_free_rows(curve)
+    curve = _with_zero_of_free_rows(curve, table.remarks)
     if curve.phase.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
         frequency = curve.free_frequency_khz
@@ -314,11 +315,11 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
         )
 
 
-def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
+def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> TappingCurve:
     """Return a curve whose zero of the phase is that of its free rows, if the statements determine it no better.
 
     A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
-    given, with an error at least as large as theirs: taken for knowledge besides, it would count both twice.
+    given, and says so: taken for knowledge besides, it would count both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
     if stated is None or free.sum() < FEWEST_FREE_ROWS:
@@ -327,7 +328,8 @@ def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
     start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
     moved = [Instrument(sum(frequency), quality.value), Instrument(frequency.value, sum(quality))]
     of_lag = np.linalg.norm([np.median(lag_of_free_tip(curve, at)[free] - start) for at in moved])
-    return curve if stated.error < 0.9 * of_lag else replace(curve, phase_zero_deg=None)
+    own = zero_of_free_rows(stated.error) in remarks or not stated.error < of_lag
+    return replace(curve, phase_zero_deg=None) if own else curve
 
 
 def _check_range(curve: TappingCurve, zero: float) -> None:
