@@ -530,6 +530,18 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     assert [run(AMPLITUDES, "--curve", number).exit_code for number in (1, 9)] == [0, 2]
 
 
+@pytest.mark.parametrize(("points", "noise"), [(200, 0.004), (1000, 0.002), (1000, 0.0005)])
+def test_the_scale_by_the_slope_is_known_as_well_as_it_says(tmp_path: Path, points: int, noise: float):
+    pulls = []
+    for seed in range(20):
+        text = raw_curve(points, seed=seed, noise=noise).text
+        scale = read_curve(saved(tmp_path, text), **OPTIONS).known["nm_per_volt"]
+        assert scale.error is not None
+        pulls.append((float(scale.value) - NM_PER_VOLT) / scale.error)
+    # on the safe side where rows are many; with the scatter about the line alone it was 2.5, 1.1 and 5.6
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+
+
 def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
     # found by tests/fuzz.py: the line's error is 0, and its weight was none
     offsets = [-50, -49, -48, -47, 46, *range(-45, -30)]

@@ -18,7 +18,7 @@ class ContactSlope(NamedTuple):
         value: change of the amplitude per nm of height.
         error: standard error of it by the scatter about the line.
         bend: standard error of it because the line may be bent too little to be seen: a tenth of the change of a
-            parabola's slope along it.
+            parabola's slope along it, and of that change's error.
         from_nm: height of its first row.
         to_nm: height of its last row, the nearest to the sample.
     """
@@ -178,12 +178,13 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     windows = [(a, b, line) for a, b, line in lines if line is not None]
     # windows that the far end cuts off count only where there is no whole one
     whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
-    chosen, first, last = _line(offset, values), 0, rows
+    chosen, first, last, usual = _line(offset, values), 0, rows, 0.0
     if whole:
         slopes, errors, scatters = np.array([line for *_, line in whole]).T
         # settled is a window that scatters about its line by at most three times what most do, or 6 % of its fall: of a
         # jump a line leaves 17 %
-        settled = scatters <= np.maximum(3.0 * np.median(scatters), 0.06 * length * np.abs(slopes)) + 1e-12
+        usual = float(np.median(scatters))
+        settled = scatters <= np.maximum(3.0 * usual, 0.06 * length * np.abs(slopes)) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
         start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
@@ -195,8 +196,11 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     # a slope differs from 0 by four standard errors
     if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
-    bend = 0.1 * abs(_change_of_slope(offset[first:last], values[first:last])[0])
-    return ContactSlope(chosen[0], chosen[1], bend, float(offset[first]), float(offset[last - 1]))
+    part = offset[first:last]
+    # few rows may lie on a line by chance
+    error = max(chosen[1], usual / float(np.linalg.norm(part - part.mean())))
+    bend = 0.1 * float(np.hypot(*_change_of_slope(part, values[first:last])))
+    return ContactSlope(chosen[0], error, bend, float(part[0]), float(part[-1]))
 
 
 def _straight_from(offset: Rows, values: Rows, first: int) -> int:
@@ -213,8 +217,8 @@ def _straight_from(offset: Rows, values: Rows, first: int) -> int:
 
 
 def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:
-    """Return how much a parabola's slope changes along rows, and the standard error; 0 of less than six heights."""
-    if len(np.unique(offset)) < 6:
+    """Return how much a parabola's slope changes along rows, and the standard error; 0 of less than five heights."""
+    if len(np.unique(offset)) < 5:
         return 0.0, 0.0
     width = float(np.ptp(offset))
     (bend, _, _), covariance = np.polyfit((offset - offset.mean()) / width, values, 2, cov=True)
