@@ -178,7 +178,8 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     windows = [(a, b, line) for a, b, line in lines if line is not None]
     # windows that the far end cuts off count only where there is no whole one
     whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
-    chosen, first, last, usual = _line(offset, values), 0, rows, 0.0
+    chosen = _line(offset, values)
+    first, last, usual = 0, rows, 0.0
     if whole:
         slopes, errors, scatters = np.array([line for *_, line in whole]).T
         # settled is a window that scatters about its line by at most three times what most do, or 6 % of its fall: of a
@@ -207,7 +208,8 @@ def _straight_from(offset: Rows, values: Rows, first: int) -> int:
     """Return from which row on the slope is known to 3 %, as far as the rows up to the last lie on a line."""
     step = max(len(offset) - first, 4) // 4
     while first > 0:
-        line, trial = _line(offset[first:], values[first:]), max(first - step, 0)
+        line = _line(offset[first:], values[first:])
+        trial = max(first - step, 0)
         known = line is not None and line[1] < 0.03 * abs(line[0])
         change, error = _change_of_slope(offset[trial:], values[trial:])
         if known or len(offset) - trial < 6 or abs(change) > 2.0 * error + 1e-12 * abs(values[-1]):

@@ -111,7 +111,7 @@ def _read(path: str | Path) -> Recording:
             arrays = {printable(key): array for key, array in arrays.items()}
             spelled = {unit.lower(): unit for unit in UNITS}
             units = {key: spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
-            images = {key: a for key, a in arrays.items() if np.ndim(a) == 2 and np.asarray(a).dtype.kind in "fiu"}
+            images = {key: image for key, image in arrays.items() if image.ndim == 2 and image.dtype.kind in "fiu"}
             if not images:
                 raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
             return Recording("arrays", name, (Segment(1, "", images),), units)

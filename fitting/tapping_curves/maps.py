@@ -30,11 +30,7 @@ _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
 _BLOCK = 1 << 16
 """Pixels that are computed at once: more of them leave the processor's cache, and take twice as long."""
-_UNITS = {
-    key: unit
-    for key, unit in UNIT_OF.items()
-    if key not in {"offset_origin_nm", "amplitude_error_nm", "phase_error_deg"}
-}
+_UNITS = {key: unit for key, unit in UNIT_OF.items() if key != "offset_origin_nm"}
 _OVER_IT = "not known: energies are over it, in nm^2"
 _NEEDED = {"free_frequency_khz": "KHZ", "quality_factor": "Q", "free_amplitude_nm": "NM", "free_phase_deg": "DEGREES"}
 ARRAYS = ("energy", "energy_error", "virial", "virial_error")
