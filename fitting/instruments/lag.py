@@ -134,7 +134,8 @@ class PhaseReadings(NamedTuple):
         Raises:
             TableError: if it is.
         """
-        level, lag = (float(np.median(part[self.seen_free])) for part in (self.phase_deg, self.free_lag_deg))
+        level = float(np.median(self.phase_deg[self.seen_free]))
+        lag = float(np.median(self.free_lag_deg[self.seen_free]))
         near = abs(np.rad2deg(abs(level)) - lag) < 30.0 < lag
         if near and np.nanmax(np.abs(self.phase_deg)) < 2.0 * np.pi and abs(np.rad2deg(level)) > 0.5 * lag:
             raise TableError(

@@ -182,7 +182,8 @@ def invert(
     known = NEUTRAL | {name: value for name, (value, _) in stated.items()}
     known |= {"quality_factor": table.quality_factor or UNDAMPED, "free_frequency_khz": table.free_frequency_khz}
     drive = (table.order, table.drive_frequency_khz, table.excitation_nm, table.offset_nm)
-    row = Row(*(np.asarray(column, float) for column in drive), phase_deg=value[:, 2], free=np.zeros(table.rows, bool))
+    never = np.zeros(table.rows, bool)
+    row = Row(*(np.asarray(column, float) for column in drive), phase_deg=value[:, 2], free=never)
     instrument = np.tile([known.get(name, 0.0) for name in _INSTRUMENT], (table.rows, 1))
     impact, own, shared, chi2 = invert_rows(row, instrument, value, error)
     for found in (impact, own, shared):
