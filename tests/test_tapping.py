@@ -296,7 +296,7 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
     row = int(np.argmax(table.offset_nm * (np.asarray(table.lockin_amplitude_nm) > 0.6 * table.excitation_nm)))
     wrong[row] = 250.0
     for other, said in (
-        (np.deg2rad(lag), "write degrees, not radians"),
+        (np.deg2rad(lag), "it is in radians; write degrees"),
         (wrong, r"lags by 250.0 degrees .*outside 0 to 180, as 1 of"),
     ):
         with pytest.raises(TableError, match=said):

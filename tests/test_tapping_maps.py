@@ -181,7 +181,7 @@ def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: f
 
 
 def test_without_the_free_tip_an_image_gives_no_energy(tmp_path: Path):
-    (path,) = written(tmp_path, "npz")
+    path = written(tmp_path, "npz")
     for left_out in ("free_phase_deg", "free_amplitude_nm"):
         known = {key: value for key, value in LEVER.items() if key != left_out}
         with pytest.raises(TableError, match=f"give `{left_out}=.*; record amplitude and phase of the free tip"):
@@ -279,34 +279,27 @@ def igor_image(amplitude: np.ndarray, phase: np.ndarray, more: str = "ImagingMod
     return igor_wave({name: values.T[:, ::-1] for name, values in channels.items()}, note)
 
 
-def written(folder: Path, kind: str) -> list[Path]:
+def written(folder: Path, kind: str) -> Path:
     amplitude, lag, _ = image()
-    path, phase = folder / f"image.{kind}", folder / "phase.csv"
+    path = folder / f"image.{kind}"
     if kind == "npz":
         np.savez(path, amplitude_nm=amplitude, phase_deg=lag)
     elif kind == "npy":
         np.save(path, np.stack([amplitude, lag]))
-    elif kind == "csv":
-        np.savetxt(path, amplitude, delimiter=",", header="amplitude in nm\n")
-        np.savetxt(phase, lag, delimiter=",")
-        return [path, phase]
     else:
         path.write_bytes({"ibw": igor_image, "gwy": gwyddion_image, "nid": nanosurf_image}[kind](amplitude, lag))
-    return [path]
+    return path
 
 
-@pytest.mark.parametrize("kind", ["npz", "npy", "csv", "ibw", "gwy", "nid"])
+@pytest.mark.parametrize("kind", ["npz", "npy", "ibw", "gwy", "nid"])
 def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
     if kind in {"gwy", "nid"}:
         pytest.importorskip("gwyddionpy")
     amplitude, lag, _ = image()
-    found = read_images(*written(tmp_path, kind))
+    found = read_images(written(tmp_path, kind))
     np.testing.assert_allclose(found.amplitude, amplitude, rtol=3e-7)
     np.testing.assert_allclose(found.phase_deg, lag, rtol=3e-7)
     assert found.size_m == ((1e-6, 2e-6) if kind in {"ibw", "gwy", "nid"} else None)
-    if kind == "csv":
-        amplitude_file, phase_file = written(tmp_path, kind)
-        assert np.array_equal(read_images((amplitude_file, phase_file)).phase_deg, found.phase_deg)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -331,7 +324,7 @@ def test_a_measured_image_by_gwyddion_is_what_the_vendors_package_reads():
 
 def test_gwyddions_program_is_limited_and_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("gwyddionpy")
-    (path,) = written(tmp_path, "nid")
+    path = written(tmp_path, "nid")
     strange = tmp_path / "-strange.xyz"
     strange.write_bytes(b"\xff\xfe nothing that anybody knows")
     for name, value, file, said in (
@@ -355,7 +348,7 @@ def test_gwyddions_program_is_limited_and_named_where_it_is_missing(tmp_path: Pa
 
 def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
     zarr = pytest.importorskip("zarr")
-    (path,) = written(tmp_path, "gwy")
+    path = written(tmp_path, "gwy")
     out = tmp_path / "report"
     formats = ["--format", "npz", "--format", "gsf", "--format", "zarr"]
     result = run(path, *CALL, "13.4", *formats, "--json", "--out", out)
@@ -405,14 +398,12 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
     np.savez(tmp_path / "one.npz", amplitude=amplitude)
     np.savez(tmp_path / "sizes.npz", amplitude=amplitude, phase=lag[:-1])
     np.savez(tmp_path / "volts.npz", amplitude_v=amplitude, phase_deg=lag)
-    (tmp_path / "ragged.csv").write_text("1,2\n3\n")
     (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
-    (stored,), _ = written(tmp_path, "npz"), written(tmp_path, "gwy")
+    stored, _ = written(tmp_path, "npz"), written(tmp_path, "gwy")
     for name, said in (
         ("one.npz", "no phase_lag_deg among the channels amplitude; say --columns"),
         ("sizes.npz", "must be rows of one size"),
         ("volts.npz", "give --nm-per-volt NM"),
-        ("ragged.csv", "cannot be read (ValueError: the number of columns changed"),
         ("cut.gwy", "gwyddionpy does not read it"),
     ):
         result = run(tmp_path / name, *CALL, "13.4")

@@ -36,7 +36,6 @@ class ImagingOptions:
 def map_of_an_image(
     session: Session,  # noqa: ARG001
     image: Annotated[Path, "IMAGE"],
-    phase_image: Annotated[Path | None, "[PHASE_IMAGE]"] = None,
     *,
     columns: Annotated[str, "COLUMN=CHANNEL[:UNIT][:FACTOR],..."] = "",
     formats: Annotated[Sequence[Literal["npz", "gsf", "zarr"]], "--format"] = ("npz",),
@@ -44,24 +43,22 @@ def map_of_an_image(
 ) -> Output:
     """Determine the energy of a tap and the virial at every pixel of an image of amplitude and phase.
 
-    IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
-    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw (`pip install
-    'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs its program on
-    the file). Amplitude and phase of the free tip at the same drive are required. Each pixel has its own error; the
-    common error (spring constant, frequency, Q, calibration, free amplitude and phase) is given once. Pixels out of
-    range (amplitude above the free one, energy below zero beyond its error) are masked and counted. With --out map.png,
-    .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the median energy is below zero or only
-    bracketed, or the unknown sense of the phase decides.
+    IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), or an instrument's file with
+    channels of both: Asylum .ibw (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install
+    'afm-jax[gwyddion]'`, which runs its program on the file). Amplitude and phase of the free tip at the same drive are
+    required. Each pixel has its own error; the common error (spring constant, frequency, Q, calibration, free amplitude
+    and phase) is given once. Pixels out of range (amplitude above the free one, energy below zero beyond its error) are
+    masked and counted. With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
+    median energy is below zero or only bracketed, or the unknown sense of the phase decides.
 
     Args:
         session: of the call.
         image: the file.
-        phase_image: the phase, if in a file of its own.
         columns: the image of each quantity, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
         formats: of the arrays written into --out (gsf: for Gwyddion), else npz; may be given several times.
         **imaging: as `ImagingOptions` and `LeverOptions`.
     """
-    result = tapping_map(read_images(image, phase_image, columns=columns), **imaging)
+    result = tapping_map(read_images(image, columns=columns), **imaging)
     return Output.of_report(
         result, lambda: text_of(map_report(result)), lambda folder, _: write_map(result, folder, formats)
     )

@@ -259,10 +259,10 @@ def _assumed(evidence: Evidence) -> str:
 def _scatter(evidence: Evidence) -> str:
     """Return how far repeated readings contradict their errors, in words."""
     repeats = repeats_of(evidence.table)
-    if repeats is None or IMPROBABLE <= repeats.p_value <= 1.0 - IMPROBABLE:
+    if repeats is None or IMPROBABLE <= repeats["p_value"] <= 1.0 - IMPROBABLE:
         return ""
-    rows = f"{repeats.rows} rows of {repeats.drives} drives"
-    return f"{repeats.error_ratio:.2g} times as much as their errors say ({rows})"
+    rows = f"{repeats['rows']} rows of {repeats['drives']} drives"
+    return f"{repeats['error_ratio']:.2g} times as much as their errors say ({rows})"
 
 
 def _limits(evidence: Evidence) -> list[str]:

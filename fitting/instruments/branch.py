@@ -16,13 +16,16 @@ class ContactSlope(NamedTuple):
 
     Attributes:
         value: change of the amplitude per nm of height.
-        error: standard error of it.
+        error: standard error of it by the scatter about the line.
+        bend: standard error of it because the line may be bent too little to be seen: a tenth of the change of a
+            parabola's slope along it, and of that change's error.
         from_nm: height of its first row.
         to_nm: height of its last row, the nearest to the sample.
     """
 
     value: float
     error: float
+    bend: float
     from_nm: float
     to_nm: float
 
@@ -175,11 +178,14 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     windows = [(a, b, line) for a, b, line in lines if line is not None]
     # windows that the far end cuts off count only where there is no whole one
     whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
-    chosen, first, last = _line(offset, values), 0, rows
+    chosen = _line(offset, values)
+    first, last, usual = 0, rows, 0.0
     if whole:
         slopes, errors, scatters = np.array([line for *_, line in whole]).T
-        # settled is a window that scatters about its line by three times what most do, at most
-        settled = scatters <= 3.0 * np.median(scatters) + 1e-12
+        # settled is a window that scatters about its line by at most three times what most do, or 6 % of its fall: of a
+        # jump a line leaves 17 %
+        usual = float(np.median(scatters))
+        settled = scatters <= np.maximum(3.0 * usual, 0.06 * length * np.abs(slopes)) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
         start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
@@ -191,7 +197,11 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     # a slope differs from 0 by four standard errors
     if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
-    return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]))
+    part = offset[first:last]
+    # few rows may lie on a line by chance
+    error = max(chosen[1], usual / float(np.linalg.norm(part - part.mean())))
+    bend = 0.1 * float(np.hypot(*_change_of_slope(part, values[first:last])))
+    return ContactSlope(chosen[0], error, bend, float(part[0]), float(part[-1]))
 
 
 def _straight_from(offset: Rows, values: Rows, first: int) -> int:
@@ -199,17 +209,22 @@ def _straight_from(offset: Rows, values: Rows, first: int) -> int:
     step = max(len(offset) - first, 4) // 4
     while first > 0:
         line = _line(offset[first:], values[first:])
-        if line is not None and line[1] < 0.03 * abs(line[0]):
-            return first
         trial = max(first - step, 0)
-        place = offset[trial:] - offset[trial:].mean()
-        if len(place) < 6:
-            return first
-        (bend, _, _), covariance = np.polyfit(place / np.ptp(place), values[trial:], 2, cov=True)
-        if abs(bend) > 2.0 * np.sqrt(covariance[0, 0]) + 1e-12 * abs(values[-1]):
-            return first
+        known = line is not None and line[1] < 0.03 * abs(line[0])
+        change, error = _change_of_slope(offset[trial:], values[trial:])
+        if known or len(offset) - trial < 6 or abs(change) > 2.0 * error + 1e-12 * abs(values[-1]):
+            break
         first = trial
     return first
+
+
+def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:
+    """Return how much a parabola's slope changes along rows, and the standard error; 0 of less than five heights."""
+    if len(np.unique(offset)) < 5:
+        return 0.0, 0.0
+    width = float(np.ptp(offset))
+    (bend, _, _), covariance = np.polyfit((offset - offset.mean()) / width, values, 2, cov=True)
+    return 2.0 * float(bend) / width, 2.0 * float(np.sqrt(covariance[0, 0])) / width
 
 
 def _line(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float, float] | None:

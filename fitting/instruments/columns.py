@@ -108,7 +108,7 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
 
 
 def needed_channel(
-    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE, mend: str = ""
+    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE
 ) -> ColumnSource:
     """Return the channel that becomes a column, as `channel_of`.
 
@@ -117,7 +117,6 @@ def needed_channel(
         role: the column.
         wanted: channels that the caller names, by column.
         roles: the columns that the error asks for.
-        mend: what else the error says.
 
     Raises:
         TableError: if nothing tells which one, or as `channel_of`.
@@ -125,7 +124,7 @@ def needed_channel(
     source = channel_of(recording, role, wanted)
     if source is None:
         listed, paste = ", ".join(recording.channels), columns_to_paste(recording, roles)
-        raise TableError(f"{recording.source}: no {role} among the channels {listed}; {paste}{mend}")
+        raise TableError(f"{recording.source}: no {role} among the channels {listed}; {paste}")
     return source
 
 

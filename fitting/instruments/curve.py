@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float
 from afm_jax.checks import check_parameter, checked
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
-from afm_jax.words import printable
 from fitting.instruments.bins import binned, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import (
@@ -35,6 +34,7 @@ from fitting.instruments.formats import read_recording
 from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, free_lag_deg, sense_of_phase
 from fitting.instruments.recording import (
     ASSUMED_RESONANCE,
+    UNIT_OF,
     UNITS,
     Known,
     Recording,
@@ -48,17 +48,7 @@ from fitting.tables.csv_text import TableError
 from fitting.tables.table import ERROR_OF, AmplitudeTable, csv_of
 
 FORMAT_VERSION = 1
-OPTIONS = {
-    "drive_frequency_khz": "kHz",
-    "free_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "nm_per_volt": "nm/V",
-    "offset_origin_nm": "nm",
-    "amplitude_error_nm": "nm",
-    "phase_error_deg": "deg",
-}
+OPTIONS = {key: unit for key, unit in UNIT_OF.items() if key not in {"free_phase_deg", "tip_calibration"}}
 """Numbers that the caller may give in place of the file's; each is an option of `afm-jax read` with dashes."""
 _NEEDED = ("drive_frequency_khz", "free_frequency_khz", "free_amplitude_nm", "nm_per_volt")
 _WANTED = ("quality_factor", "spring_constant_n_per_m")
@@ -382,14 +372,14 @@ def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
 
 def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     """Return the weighted mean of the branches' slopes, its error widened by what they differ beyond theirs."""
-    slopes = np.array([[look.slope.value, look.slope.error] for look in looks.values() if look.slope is not None])
+    slopes = np.array([look.slope[:3] for look in looks.values() if look.slope is not None])
     if not slopes.size:
         return None
     # rows that lie on a line exactly leave no error at all
     weights = np.maximum(slopes[:, 1], 1e-9 * np.abs(slopes[:, 0])) ** -2.0
-    mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
+    mean, bend = np.average(slopes[:, [0, 2]], axis=0, weights=weights).tolist()
     chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
-    return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
+    return mean, float(np.hypot(np.sqrt(max(chi2, 1.0) / weights.sum()), bend))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
@@ -468,13 +458,7 @@ def _add_phase(
     readings = _phase_readings(curve, looks)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
-    # read as radians the phase is the lag of the free tip within 30 degrees
-    near = abs(np.rad2deg(abs(level)) - lag) < 30.0 < lag
-    if near and np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(level)) > 0.5 * lag:
-        raise TableError(
-            f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
-            'degrees: it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'
-        )
+    readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
     s, quality, either = readings.frequency_ratio[0], readings.quality_factor, np.array([1.0, -1.0])
     of_ratio = free_lag_deg(readings.drive, s * (1.0 + readings.frequency_error * either), quality)
     of_quality = free_lag_deg(readings.drive, s, quality * (1.0 + readings.quality_error * either))

@@ -8,7 +8,7 @@ import io
 import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,9 +41,6 @@ from fitting.tables.csv_text import (
     split_lines,
     text_of,
 )
-
-_WAYS = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
-_WAYS |= {"retract": "retract", "bwd": "retract", "backward": "retract"}
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -97,23 +94,22 @@ def parse_text(data: bytes, name: str) -> Recording:
     head = [line for number, line in rows if number < start] or [comment for _, comment in comments]
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]
     header = {pair[0]: re.sub(r"^(\[.*?\])\s*(.*?)\s*$", r"\2 \1", pair[1]) for pair in pairs if len(pair) == 2}
-    columns, units, ways = _columns([row for row in rows if row[0] > start], name)
+    columns, units = _columns([row for row in rows if row[0] > start], name)
+    count = len(next(iter(columns.values()), ()))
     kind, away, remarks = ("Nanonis text", ("Z rel", "Z"), ()) if start else ("separated text", (), ())
-    runs = np.zeros(len(ways))
+    runs = np.zeros(count)
     if any("neaspec" in comment.lower() for _, comment in comments):
         kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
         remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
-        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [len(ways)]
+        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [count]
         declared = int(np.prod([int(pixel) for pixel in pixels[:3]]))
-        if len(ways) % max(declared, 1) or len(ways) < declared:
-            raise cut_off(name, f"the header announces {declared} rows, but {len(ways)} are there")
+        if count % max(declared, 1) or count < declared:
+            raise cut_off(name, f"the header announces {declared} rows, but {count} are there")
         columns = {title: numbers for title, numbers in columns.items() if re.fullmatch(r"Z|[MO]\d[AP]", title)}
         units = {title: {"Z": "m", "A": "nm", "P": "rad"}[title[-1]] for title in columns}
     segments = [
-        Segment(number, way, {title: numbers[rows_of_it] for title, numbers in columns.items()})
+        Segment(number, "", {title: numbers[runs == run] for title, numbers in columns.items()})
         for number, run in enumerate(dict.fromkeys(runs.tolist()), start=1)
-        for way in dict.fromkeys(ways)
-        if (rows_of_it := (runs == run) & (np.array(ways) == way)).any()
     ]
     back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
     if back:
@@ -123,8 +119,8 @@ def parse_text(data: bytes, name: str) -> Recording:
     return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
 
 
-def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str], list[str]]:
-    """Return the columns below a row of names (NaN where a cell holds no number), their units, and the way of each row.
+def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return the columns below a row of names (NaN where a cell holds no number), and their units.
 
     Raises:
         TableError: if a row has another number of cells than the first.
@@ -154,9 +150,7 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
     numbers = numbers.reshape(len(body), len(titles))
     columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
-    place = next((k for k, title in enumerate(titles) if title.lower() in {"branch", "direction", "segment"}), None)
-    ways = [""] * len(body) if place is None else [_WAYS.get(cells[place].lower(), "") for cells in body]
-    return columns, units, ways if all(ways) else [""] * len(body)
+    return columns, units
 
 
 def _name_and_unit(text: str) -> tuple[str, str]:
@@ -256,8 +250,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
         if frame in branches:
             axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"])
             units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
-            for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
-                parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers
+            points, bits = int(keys["Points"]), int(keys["SaveBits"])
+            whole = np.frombuffer(data[end - size : end], {16: "<i2", 32: "<i4"}[bits]).reshape(-1, points)
+            scaled = (whole / 2.0**bits + 0.5) * float(keys["Dim2Range"]) + float(keys["Dim2Min"])
+            for line, numbers in enumerate(scaled):
+                own = [keys.get(f"LineDim{line}{what}", keys.get(f"Dim0{what}")) for what in ("Min", "Range")]
+                used = min(int(keys.get(f"LineDim{line}Points", points)), points)
+                low, width = (float(value or "nan") for value in own)
+                at = low + width * np.arange(used) / max(used - 1, 1)
+                parts.setdefault((line + 1, branches[frame]), {axis: at})[channel] = numbers[:used].copy()
     if not parts:
         mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
         raise TableError(f"{name}: holds no curve and no spectrum; {mend}")
@@ -268,18 +269,6 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
         known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
-
-
-def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Give the axis and the numbers of every line of a data set."""
-    points, bits = int(keys["Points"]), int(keys["SaveBits"])
-    whole = np.frombuffer(data, {16: "<i2", 32: "<i4"}[bits]).reshape(-1, points)
-    scaled = (whole / 2.0**bits + 0.5) * float(keys["Dim2Range"]) + float(keys["Dim2Min"])
-    for line, numbers in enumerate(scaled):
-        own = [keys.get(f"LineDim{line}{what}", keys.get(f"Dim0{what}")) for what in ("Min", "Range")]
-        used = min(int(keys.get(f"LineDim{line}Points", points)), points)
-        low, width = (float(value or "nan") for value in own)
-        yield low + width * np.arange(used) / max(used - 1, 1), numbers[:used].copy()
 
 
 # ---- Igor

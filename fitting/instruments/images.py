@@ -1,12 +1,10 @@
 """Amplitude and phase of every pixel, out of arrays and the files of images that instruments write.
 
 Asylum's .ibw is read by igor2 (`pip install 'afm-jax[instruments]'`), every other format by gwyddionpy, which runs
-Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays and text of numbers need nothing.
+Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays need nothing.
 """
 
 import io
-import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import printable
-from fitting.instruments.columns import channel_of, needed_channel, parse_columns
+from fitting.instruments.columns import needed_channel, parse_columns
 from fitting.instruments.formats import IGOR, parse_igor
 from fitting.instruments.recording import (
     UNITS,
@@ -31,8 +29,6 @@ from fitting.tables.csv_text import TableError, read_bytes
 
 _ROLES = {"lockin_amplitude_nm": "amplitude", "phase_lag_deg": "phase"}
 """What is read of images, and what arrays of it are called."""
-_ROWS_OF_NUMBERS = re.compile(rb"(\xef\xbb\xbf)?(#[^\n]*\n|\s)*([-+.\d]|nan\b)", re.IGNORECASE)
-"""How text of numbers begins, below comments."""
 _PATIENCE_S = 60.0
 """That Gwyddion's program may take for a file; an image takes it less than a second."""
 
@@ -61,15 +57,12 @@ class AmplitudeAndPhase(NamedTuple):
     note: str
 
 
-def read_images(
-    path: str | Path | tuple[Any, Any], phase_path: str | Path | None = None, *, columns: str = ""
-) -> AmplitudeAndPhase:
+def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> AmplitudeAndPhase:
     """Return amplitude and phase of every pixel of an image.
 
     Args:
-        path: NumPy .npz or .npy, text of numbers (one channel), Asylum .ibw or any format that Gwyddion reads; or the
-            arrays of amplitude in nm and phase in degrees, the channels `amplitude` and `phase`; or two paths.
-        phase_path: file of the phase, where amplitude and phase are two.
+        path: NumPy .npz or .npy, Asylum .ibw or any format that Gwyddion reads; or the arrays of amplitude in nm and
+            phase in degrees, the channels `amplitude` and `phase`.
         columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
             leads.
 
@@ -77,17 +70,14 @@ def read_images(
         TableError: one line: the file is damaged, of no known format or of another mode, has no such channel, or the
             package that reads it is missing.
     """
-    if isinstance(path, tuple) and isinstance(path[0], str | Path):
-        path, phase_path = path
     if isinstance(path, tuple):
         channels = dict(zip(_ROLES.values(), path, strict=True))
         images = Recording("arrays", "arrays", (Segment(1, "", channels),), {"amplitude": "nm", "phase": "deg"})
     else:
-        images = _read(path) if phase_path is None else _together(_read(path), _read(phase_path))
+        images = _read(path)
     refuse_other_modes(images.settings, images.source)
     wanted = parse_columns(columns)
-    two = ", or give amplitude and phase as two files"
-    taken = {role: needed_channel(images, role, wanted, _ROLES, two) for role in _ROLES}
+    taken = {role: needed_channel(images, role, wanted, _ROLES) for role in _ROLES}
     amplitude, phase = (
         np.asarray(images.segments[0].channels[one.channel], float) * (abs(one.factor or 1.0) * UNITS[one.unit][1])
         for one in taken.values()
@@ -109,17 +99,6 @@ def read_images(
     )
 
 
-def _together(first: Recording, second: Recording) -> Recording:
-    """Return the amplitude of a file and the phase of another, each the first channel where none is called so."""
-    channels, units = {}, {}
-    for (role, name), images in zip(_ROLES.items(), (first, second), strict=True):
-        found = channel_of(images, role, {})
-        channel = images.channels[0] if found is None else found.channel
-        channels[name], units[name] = images.segments[0].channels[channel], images.units.get(channel, "")
-    source, settings = f"{first.source} and {second.source}", {**second.settings, **first.settings}
-    return replace(first, source=source, segments=(Segment(1, "", channels),), units=units, settings=settings)
-
-
 # ---- formats
 
 
@@ -128,23 +107,17 @@ def _read(path: str | Path) -> Recording:
     with damaged_as_one_line(name):
         if data.startswith((b"PK", b"\x93NUMPY")):
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
-            arrays = dict(loaded) if hasattr(loaded, "files") else dict(zip(_ROLES.values(), loaded, strict=False))
+            arrays = loaded if hasattr(loaded, "files") else dict(zip(_ROLES.values(), loaded, strict=False))
+            arrays = {printable(key): array for key, array in arrays.items()}
             spelled = {unit.lower(): unit for unit in UNITS}
-            units = {printable(key): spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
-            return _of_arrays(arrays, units, name)
+            units = {key: spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
+            images = {key: image for key, image in arrays.items() if image.ndim == 2 and image.dtype.kind in "fiu"}
+            if not images:
+                raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
+            return Recording("arrays", name, (Segment(1, "", images),), units)
         if data.startswith(IGOR):
             return parse_igor(data, name)
-        if _ROWS_OF_NUMBERS.match(data):
-            rows = re.sub("[\t;,]", " ", data.decode("utf-8-sig")).splitlines()
-            return _of_arrays({Path(name).stem: np.loadtxt(rows, ndmin=2)}, {}, name)
         return _of_others(Path(path), name)
-
-
-def _of_arrays(arrays: dict[str, np.ndarray], units: dict[str, str], name: str) -> Recording:
-    images = {printable(key): a for key, a in arrays.items() if np.ndim(a) == 2 and np.asarray(a).dtype.kind in "fiu"}
-    if not images:
-        raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
-    return Recording("arrays", name, (Segment(1, "", images),), units)
 
 
 def _of_others(path: Path, name: str) -> Recording:

@@ -17,6 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.words import printable
+from fitting.tables.csv_text import TableError
+
 Numbers = float | Float[np.ndarray, "..."]
 Rows = Float[np.ndarray, " rows"]
 SENSES = {"lag": 1.0, "lead": -1.0}
@@ -120,6 +123,25 @@ class PhaseReadings(NamedTuple):
             return of_height
         of_base = np.imag((1.0 - gamma) * (1.0 - np.conj(phasor)))
         return np.abs(1.0 - gamma) ** 2 * of_height + np.abs(gamma) ** 2 * of_base
+
+    def refuse_radians(self, source: str, mend: str) -> None:
+        """Check that the phase is not in radians: read as such it would be the lag of the free tip to 30 degrees.
+
+        Args:
+            source: the file.
+            mend: what to do.
+
+        Raises:
+            TableError: if it is.
+        """
+        level = float(np.median(self.phase_deg[self.seen_free]))
+        lag = float(np.median(self.free_lag_deg[self.seen_free]))
+        near = abs(np.rad2deg(abs(level)) - lag) < 30.0 < lag
+        if near and np.nanmax(np.abs(self.phase_deg)) < 2.0 * np.pi and abs(np.rad2deg(level)) > 0.5 * lag:
+            raise TableError(
+                f"{printable(source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
+                f"degrees: it is in radians; {mend}"
+            )
 
     @property
     def detuning(self) -> float:

@@ -170,6 +170,22 @@ def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Kn
     return found
 
 
+UNIT_OF = {
+    "drive_frequency_khz": "kHz",
+    "free_frequency_khz": "kHz",
+    "quality_factor": "",
+    "spring_constant_n_per_m": "N/m",
+    "free_amplitude_nm": "nm",
+    "free_phase_deg": "deg",
+    "nm_per_volt": "nm/V",
+    "tip_calibration": "",
+    "offset_origin_nm": "nm",
+    "amplitude_error_nm": "nm",
+    "phase_error_deg": "deg",
+}
+"""Numbers of lever, drive and instrument that a caller may give, with their units."""
+
+
 def given_numbers(
     numbers: Mapping[str, Any], units: Mapping[str, str], *, any_sign: Sequence[str] = ()
 ) -> dict[str, Known]:
@@ -222,7 +238,7 @@ _OTHER_MODES = re.compile(
     r"|frequency[ -]modulation|pll|stm|kpfm|skpm|efm|mfm|bimodal|dual|peak ?force|scanasyst|hopping|qi|qnm)\b",
     re.IGNORECASE,
 )
-_MODE_KEYS = re.compile(r"((imaging|operating|operation|afm|feedback|scan)[ _-]?)?mode", re.IGNORECASE)
+_MODE_KEYS = re.compile(r"((imaging|operating|operation|op\.|afm|feedback|scan)[ _-]?)?mode", re.IGNORECASE)
 _STRICT_KEYS = {"ImagingMode", "Op. mode"}
 """Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
 
@@ -246,7 +262,7 @@ def refuse_other_modes(settings: Mapping[str, str], source: str, channels: Itera
         others = _AMPLITUDE_MODES.sub("", value)
         strict = name in _STRICT_KEYS and others == value
         bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
-        if bimodal or strict or ((_MODE_KEYS.fullmatch(name) or name in _STRICT_KEYS) and _OTHER_MODES.search(others)):
+        if bimodal or strict or (_MODE_KEYS.fullmatch(name) and _OTHER_MODES.search(others)):
             found.insert(0, f"was recorded in the mode {printable(value)!r} ({printable(key)}), not in")
     if found:
         why = "amplitude modulation (tapping) of one mode; its amplitude and phase do not give the energy of a tap"

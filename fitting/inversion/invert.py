@@ -171,27 +171,23 @@ def invert(
         )
     value, error = readings_of(table)
     measured = np.isfinite(value) & np.isfinite(error)
-    chosen = np.flatnonzero(measured[:, 2:].any(axis=1) & measured[:, :2].any(axis=1))
-    if not chosen.size:
+    chosen = measured[:, 2] & measured[:, :2].any(axis=1)
+    if not chosen.any():
         raise TableError(
             f"{table.source}: no row has a phase with an amplitude; add the columns phase_deg and phase_error_deg, or "
             "use `afm-jax fit`"
         )
-    value, error = np.where(measured, value, 1.0)[chosen], np.where(measured, error, np.inf)[chosen]
+    value, error = np.where(measured, value, 1.0), np.where(measured, error, np.inf)
     stated = {name: pair for name, pair in constraints_of(table, None).items() if name in _INSTRUMENT}
     known = NEUTRAL | {name: value for name, (value, _) in stated.items()}
     known |= {"quality_factor": table.quality_factor or UNDAMPED, "free_frequency_khz": table.free_frequency_khz}
     drive = (table.order, table.drive_frequency_khz, table.excitation_nm, table.offset_nm)
-    row = Row(*(np.asarray(column, float)[chosen] for column in drive), phase_deg=value[:, 2], free=chosen < 0)
-    instrument = np.tile([known.get(name, 0.0) for name in _INSTRUMENT], (chosen.size, 1))
-
-    def of_table(part: Float[np.ndarray, "chosen ..."]) -> Float[np.ndarray, "rows ..."]:
-        """Return numbers of the chosen rows as those of all rows, NaN of the others."""
-        whole = np.full((table.rows, *part.shape[1:]), np.nan)
-        whole[chosen] = part
-        return whole
-
-    impact, own, shared, chi2 = map(of_table, invert_rows(row, instrument, value, error))
+    never = np.zeros(table.rows, bool)
+    row = Row(*(np.asarray(column, float) for column in drive), phase_deg=value[:, 2], free=never)
+    instrument = np.tile([known.get(name, 0.0) for name in _INSTRUMENT], (table.rows, 1))
+    impact, own, shared, chi2 = invert_rows(row, instrument, value, error)
+    for found in (impact, own, shared):
+        found[~chosen] = np.nan
     rows = np.flatnonzero(np.isfinite(impact).all(axis=1))
     covariance = own @ np.swapaxes(own, 1, 2)
     shared = shared[:, :, [_INSTRUMENT.index(name) for name in stated]] * [error for _, error in stated.values()]

@@ -127,29 +127,14 @@ _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
 
 
-@dataclass(frozen=True)
-class RepeatedReadings:
-    """How readings of one drive scatter about their mean.
+def repeats_of(table: AmplitudeTable | SeveralTables) -> dict[str, float] | None:
+    """Return how the readings of repeated drives scatter about their mean; None where no drive was repeated.
 
-    Attributes:
-        drives: that were repeated.
-        rows: of these.
-        chi2: sum of squared deviations from each drive's mean, over the stated errors.
-        degrees_of_freedom: readings minus means.
-        error_ratio: scatter over stated error, sqrt(chi2 over degrees of freedom).
-        p_value: probability of a larger chi2 if the errors are right.
+    Returns:
+        How many `drives` were repeated, and the `rows` of these; `chi2`, the sum of squared deviations over the stated
+        errors; `degrees_of_freedom`, readings less means; `error_ratio`, scatter over stated error, the root of their
+        quotient; and the `p_value`, the probability of a larger chi2 if the errors are right.
     """
-
-    drives: int
-    rows: int
-    chi2: float
-    degrees_of_freedom: int
-    error_ratio: float
-    p_value: float
-
-
-def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None:
-    """Return how the readings of repeated drives scatter; None where no drive was repeated."""
     drives, rows, freedom, chi2 = 0, 0, 0, 0.0
     for member in table.tables:
         columns = columns_of(member)
@@ -161,11 +146,11 @@ def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None
                 freedom, chi2 = freedom + more, chi2 + squares
     if not freedom:
         return None
-    return RepeatedReadings(
-        drives=drives,
-        rows=rows,
-        chi2=chi2,
-        degrees_of_freedom=freedom,
-        error_ratio=float(np.sqrt(chi2 / freedom)),
-        p_value=chi2_tail(chi2, freedom),
-    )
+    return {
+        "drives": drives,
+        "rows": rows,
+        "chi2": chi2,
+        "degrees_of_freedom": freedom,
+        "error_ratio": float(np.sqrt(chi2 / freedom)),
+        "p_value": chi2_tail(chi2, freedom),
+    }

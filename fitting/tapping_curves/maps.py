@@ -18,7 +18,7 @@ from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, words_of
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of_phase, turned
-from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
+from fitting.instruments.recording import ASSUMED_RESONANCE, UNIT_OF, Known, given_numbers
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, phase_readings
@@ -30,16 +30,7 @@ _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
 _BLOCK = 1 << 16
 """Pixels that are computed at once: more of them leave the processor's cache, and take twice as long."""
-_UNITS = {
-    "free_frequency_khz": "kHz",
-    "drive_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "free_phase_deg": "deg",
-    "nm_per_volt": "nm/V",
-    "tip_calibration": "",
-}
+_UNITS = {key: unit for key, unit in UNIT_OF.items() if key != "offset_origin_nm"}
 _OVER_IT = "not known: energies are over it, in nm^2"
 _NEEDED = {"free_frequency_khz": "KHZ", "quality_factor": "Q", "free_amplitude_nm": "NM", "free_phase_deg": "DEGREES"}
 ARRAYS = ("energy", "energy_error", "virial", "virial_error")
@@ -126,8 +117,7 @@ def tapping_map(
     """Return energy and virial of a tap in every pixel of an image of amplitude and phase.
 
     Args:
-        images: a file for `read_images`, a pair of files, what that returned, or the arrays of amplitude in nm and
-            phase in degrees.
+        images: a file for `read_images`, what that returned, or the arrays of amplitude in nm and phase in degrees.
         columns: which channel is which, as for `read_images`, where `images` does not come from there.
         drive: what shakes the cantilever.
         phase_sense: whether the phase grows as the tip lags more, or falls; None: the energies decide where they can.

@@ -79,7 +79,6 @@ class Tapping(JudgedResult):
         fit: one energy for each drive and side, fitted with the instrument; None without a phase or rows.
         functions: the energy as a smooth function along each branch, the instrument cut off from it.
         scale_errors: whether errors are multiplied where the rows scatter more.
-        fit_with_drifts: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: upper bound of the energy lost in a tap, where only the amplitude was recorded; else None.
         hysteresis: changes of the motion that come at different heights on approach and retract.
         speeds: speeds of the impacts; None where there is no energy.
@@ -93,7 +92,6 @@ class Tapping(JudgedResult):
     fit: OneEnergy | None
     functions: EnergyFunctions
     scale_errors: bool
-    fit_with_drifts: OneEnergy | None
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None

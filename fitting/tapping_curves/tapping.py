@@ -48,8 +48,6 @@ from fitting.tapping_curves.result import Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
 LAW_MODEL = "viscous+delay"
-_FEWEST_TO_FOLLOW = 8
-"""Rows from which a drift along them is looked for."""
 _ORIGIN_NM = 0.3
 """What the height's origin is uncertain by where the table does not say."""
 
@@ -122,15 +120,11 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
     alike = touching & ~early & ~functions.outliers, repulsive, functions.smooth
-    fit, with_drifts, used = one_energy(lever, *alike), None, np.zeros(curve.rows, bool)
+    fit, used = one_energy(lever, *alike), np.zeros(curve.rows, bool)
     if fit is not None:
         used, scale = fit.used, np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
         if scale_errors and scale > 1.0:
             fit = one_energy(lever, *alike, float(scale))
-        if curve.time is None and used.sum() >= _FEWEST_TO_FOLLOW:
-            # with drifts, as if the rows stood in the order of time
-            in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-            with_drifts = one_energy(Lever([in_order], [free]), *alike)
     silent = np.isnan(curve.lag_deg)
     alone = touching & ~used & ~np.isin(np.arange(curve.rows), np.concatenate([np.zeros(0, int), *stretches]))
     # why a row is not in the fit, or what it is for: the first that holds
@@ -159,7 +153,6 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         fit=fit,
         functions=functions,
         scale_errors=scale_errors,
-        fit_with_drifts=with_drifts,
         bound_aj=None if curve.has_phase else _bound(curve, rows.largest_energy_aj[~free & ~held]),
         hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None if fit is None else speeds(functions, used),
@@ -308,21 +301,17 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
     Raises:
         TableError: if it is in radians, or not off by right angles though its zero is stated.
     """
-    seen, name = readings.seen_free, printable(curve.source)
+    seen = readings.seen_free
     if not seen.any():
         return
-    stated = curve.phase_zero_deg.value if curve.phase_zero_deg else 0.0
-    middle = float(np.median(curve.lag_deg[seen] - stated))
-    wanted = float(np.median(readings.free_lag_deg[seen]))
-    if np.nanmax(np.abs(curve.lag_deg)) < 2.0 * np.pi and abs(np.rad2deg(abs(middle)) - wanted) < _OFF_DEG:
-        raise TableError(
-            f"{name}: phase_lag_deg is {middle:.3g} where the tip is free and lags by {wanted:.1f} degrees: write "
-            "degrees, not radians"
-        )
+    readings.refuse_radians(curve.source, "write degrees")
     if curve.phase_zero_deg is not None and abs(off - 90.0 * round(off / 90.0)) > _BEYOND_DEG:
+        middle = float(np.median(curve.lag_deg[seen])) - curve.phase_zero_deg.value
+        wanted = float(np.median(readings.free_lag_deg[seen]))
         raise TableError(
-            f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
-            "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
+            f"{printable(curve.source)}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: "
+            "out of the range of '# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the "
+            "phase"
         )
 
 

@@ -28,8 +28,6 @@ _LARGEST_UNASKED_SCALE = 2.0
 times that of the free tip."""
 _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
-_FOLLOWING = 3.0
-"""Errors of a drift along the rows, of one energy for all taps, from which it is one."""
 _SAY_SO = "if they stand as they were measured, say so by '# rows = in order of time', and the drift is fitted along"
 ORIGINS = {
     "free_frequency_khz": "free frequency",
@@ -52,19 +50,6 @@ def _torn(fit: EnergyFunctions | OneEnergy) -> list[str]:
     return [f"{' and '.join(parts)} would be needed"] if parts else []
 
 
-def _drifts_of_rows(e: Any) -> list[str]:
-    """Return by what drift rows about one energy follow their order, which the table does not state as that in time."""
-    if e.fit_with_drifts is None or not e.fit_with_drifts.minimum.p_value > IMPROBABLE:
-        return []
-    units = {"phase_drift_deg": (1.0, "degrees"), "free_amplitude_drift": (100.0, "%")}
-    return [
-        f"{ORIGINS[one.kind]} of {units[one.kind][0] * one.value:+.2g} +- "
-        f"{units[one.kind][0] * one.standard_error:.1g} {units[one.kind][1]}"
-        for one in e.fit_with_drifts.nuisances
-        if one.kind in units and abs(one.value) > _FOLLOWING * one.standard_error
-    ][:1]
-
-
 NO_CONSTANT: tuple[Rule[Any], ...] = (
     Rule(lambda e: e.fit is None, "no branch has enough rows of taps that come every period for one energy"),
     Rule(lambda e: not e.fit.minimum.settled, "the fit of one energy for each branch does not converge"),
@@ -78,10 +63,6 @@ NO_CONSTANT: tuple[Rule[Any], ...] = (
         "one energy for each branch describes the rows only with errors {e.fit.scale:.1f} times as large",
     ),
     Rule(lambda e: _torn(e.fit), "one energy for each branch contradicts the instrument: {case}"),
-    Rule(
-        _drifts_of_rows,
-        f"residuals of one energy for each branch follow the order of the rows, as with a {{case}}: {_SAY_SO}",
-    ),
 )
 """Why one energy for each branch does not explain the rows; the first that applies."""
 
