@@ -150,28 +150,6 @@ def test_a_curve_that_is_attracted_where_it_should_be_repelled_has_its_phase_tur
     assert outer == ["attractive"] * 3
 
 
-def test_a_lag_near_180_degrees_is_no_phase_that_leads():
-    # Q 200, 3 % above resonance: the free tip lags by 175 degrees, and a lead would read -175
-    tip, truth = curve_of_force("repulsive", 400.0, 1.03, "force")
-    assert tip.free_reading[1] > 175.0
-    sense = sense_of(measured(tip, truth))
-    assert sense.sign == 1.0
-    assert not any(note.startswith("Sign") for note in sense.notes)
-
-
-def test_a_sign_that_is_stated_is_taken_and_not_asked_for(tmp_path: Path):
-    tip, truth = curve_of_force("repulsive", 150.0, 0.99, "force")
-    for stored, word, factor in (("lag", "lag", 1), ("lead", "lead", -1), ("free minus lag", "lead", -1)):
-        table = measured(tip, truth, stored)
-        for options in ({"phase_sense": word}, {"columns": f"phase_lag_deg=Phase:{factor}"}):
-            told = recorded(tip, table, tmp_path, **options)
-            assert told.phase_sense == "lag"
-            assert sense_of(told).origin == "stated"
-            assert not any(one.startswith("Sign") for one in told.remarks)
-            assert told.phase_lag_deg is not None
-            np.testing.assert_allclose(told.phase_lag_deg, _true_lag(tip, table, float(factor)), atol=2.0)
-
-
 def test_a_sign_that_the_curve_contradicts_is_refused():
     tip, truth = curve_of_force("repulsive", 150.0, 1.03, "force")
     assert "was stated to lead, but" in sense_of(replace(measured(tip, truth), phase_sense="lead")).reason

@@ -1,7 +1,6 @@
 """The energy of a tap as a function along a branch: shapes of measured curves, drifts, instruments without errors."""
 
 import re
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from afm_jax.cli.main import main
 from fitting.examples.make_raw_curve import raw_curve, true_energy_aj
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
-from fitting.tapping_curves.energy import _minimum
 from fitting.tapping_curves.pictures import curve_figure
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
@@ -174,20 +172,6 @@ def test_an_instrument_that_no_energy_allows_contradicts_the_curve():
     assert "of its errors from what was given would be needed" in torn.reasons[0]
 
 
-def test_a_search_that_does_not_settle_is_said():
-    result = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
-    assert result.functions is not None
-    lever = copy(result.functions.lever)
-    lever.minimum = _minimum(lambda x: x * np.nan, lambda x: np.full((len(x), len(x)), np.nan), lever.minimum.at)
-    assert not lever.minimum.settled
-    lost = replace(result, functions=replace(result.functions, lever=lever, branches=()))
-    assert lost.reasons == ["the fit of the instrument to statements and free rows does not converge"]
-    assert lost.fit is not None
-    unfitted = replace(result, fit=replace(lost.fit, minimum=lost.fit.minimum._replace(settled=False)))
-    assert (unfitted.energy["value"], unfitted.valid) == (None, True)
-    assert unfitted.energy["reason"] == "the fit of one energy for each branch does not converge"
-
-
 def test_two_long_curves_of_one_file_share_an_instrument(tmp_path: Path):
     """Of 1,005 and 1,008 points, both upwards: the common fit ran to Q = 0."""
     lines = []
@@ -238,17 +222,6 @@ def test_a_drift_along_the_rows_is_fitted_where_their_order_is_known_and_else_sa
         assert abs(found[name].value - true) < 3.5 * found[name].standard_error
     assert not blind.valid
     assert "# rows = in order of time" in blind.reasons[0]
-
-
-@pytest.mark.parametrize(
-    ("phase", "amplitude"), [(5.0, 0.0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1.0, 0.0),))]
-)
-def test_a_drift_that_free_rows_at_one_end_leave_open_is_fitted_or_said(phase: float, amplitude: float):
-    _, blind = fits_of_a_drift(phase, amplitude, 60, 1, way_back=False)
-    assert blind.energy["value"] is None or not blind.valid
-    if phase == 1.0:
-        assert "# rows = in order of time" in blind.energy["reason"]
-        assert any("# rows = in order of time" in one for one in blind.warnings)
 
 
 def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_points():
@@ -336,9 +309,3 @@ def test_speeds_of_taps_are_those_of_the_law_that_made_them(restitution: float, 
     assert known.sum() > 40
     np.testing.assert_allclose(result.speeds.rebound_speed_nm_per_us[known], rebound(u[known]), rtol=0.05)
     assert result.law_allowed
-
-
-def test_on_resonance_the_speed_of_a_tap_cannot_be_told():
-    still = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
-    assert not still.law_allowed
-    assert "driven at 1.000 of the free frequency" in still.to_dict()["reason"]
