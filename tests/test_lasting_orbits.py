@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots, follow_root
+from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import orbit_state, steady_orbits
 from tests.package_scenes import scene_of
@@ -19,8 +19,6 @@ from tests.reference_lasting import closing_impacts, closing_speeds
 DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.03, 8.0, -0.5), (4, 3.9, 8.0, 1.0)]
 find = jax.jit(lambda problem: find_roots(problem, COARSE))
 steady = jax.jit(steady_orbits)
-follow = jax.jit(follow_root)
-WANTED = jnp.asarray(1.0) > 0.0
 
 
 def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> OrbitProblem:

@@ -14,7 +14,6 @@ from tests.test_scenefile import CANTILEVER, PLATFORM
 
 WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
 SPEEDS = np.geomspace(13.0, 300.0, 12)
-HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
 SCENE = CANTILEVER + "mass_ng = 1.5\n" + PLATFORM + "[interaction]\nmodel = 'law'\n"
 
 

@@ -16,7 +16,6 @@ from afm_jax.motion.record import Simulation
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
 from afm_jax.plots.motion import draw_motion, look_at, spectrum_figure, spectrum_of
-from afm_jax.scenefile import presets
 
 ALL = ["time_course.png", "spectrum.png", "poincare.png", "force_gap.png"]
 
@@ -29,12 +28,6 @@ def drawn(scene: Scene, found: Simulation, folder: Path) -> list[str]:
         assert image.shape[1] >= 1400
         assert 0.3 < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99
     return [path.name for path in files]
-
-
-@pytest.fixture(scope="module")
-def bouncing():
-    scene = presets.contact_scene(1.01, 4.0, 0.0)
-    return scene, simulate(scene, default_start(scene), 60.0)
 
 
 def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):

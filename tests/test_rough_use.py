@@ -138,21 +138,13 @@ def test_no_message_quotes_a_name_of_any_length_or_what_commands_the_terminal(tm
     assert "\x1b" not in run("fit", tmp_path / "none\x1b.csv").output
 
 
-COMMAND = """
-import atexit, os, signal, sys, time
+DEAF = """
+import signal, sys, time
+import tests.trial_commands
 from afm_jax.cli.command import Command
 from afm_jax.cli.main import COMMANDS, main
 # a job in the background of a shell is born deaf
 signal.signal(signal.SIGINT, signal.default_int_handler)
-{}
-import tests.trial_commands
-tests.trial_commands.body = command
-COMMANDS["rough"] = Command("rough", "Check", "tests.trial_commands:trial", computes=False)
-sys.argv[1:] = ["rough"]
-main()
-"""
-"""A program with one more command."""
-DEAF = """
 class Lost:
     def __del__(self):
         raise KeyboardInterrupt
@@ -167,11 +159,16 @@ def command(session):
         except KeyboardInterrupt:
             # as in the callbacks of a garbage collection: nobody hears it
             Lost()
+tests.trial_commands.body = command
+COMMANDS["rough"] = Command("rough", "Check", "tests.trial_commands:trial", computes=False)
+sys.argv[1:] = ["rough"]
+main()
 """
+"""A program with one more command."""
 
 
 def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
-    call = [sys.executable, "-c", COMMAND.format(DEAF)]
+    call = [sys.executable, "-c", DEAF]
     with subprocess.Popen(call, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

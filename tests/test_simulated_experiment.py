@@ -16,7 +16,6 @@ pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
 
 MEASURED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
-ON_RESONANCE = ("free_amplitude_nm", "offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
 ROWS = ((1, 177.3, 4.0, 1.0), (1, 180.0, 4.0, 0.0), (2, 349.2, 4.0, -1.0), (3, 545.4, 4.0, 0.0))
 LAW = ImpactLaw(0.97, 60.0, 0.3, CollisionDelay(0.2, 5.6, 0.6))
 

@@ -92,16 +92,6 @@ def test_a_sticky_contact_on_which_the_lever_pulls_hard_is_fitted_as_wanted():
     judge_fits_of(truth, as_measured(exact))
 
 
-@pytest.mark.slow
-def test_a_soft_contact_is_predicted_as_wanted_above_resonance():
-    """The softest of those of `make tapping`: its surface is 0.6 nm above gap 0, as its delays say."""
-    truth = tapping_truth(2)
-    found = forward(truth, exact_table(truth, 1.1, TABLES, FEW_SHARES)).fast(pull_to=np.inf)
-    assert len(found.nm) == 16
-    assert judge_forward("soft", found) == 0
-    assert max(found.nm.max(), found.degrees.max()) < 0.02
-
-
 def law_at(result: FitResult, speeds: np.ndarray) -> list[np.ndarray]:
     """Return rebound speeds of a fitted law and the ends of its band."""
     law = result.law

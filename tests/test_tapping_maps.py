@@ -293,26 +293,6 @@ def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
         assert np.array_equal(read_images((amplitude_file, phase_file)).phase_deg, found.phase_deg)
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_a_measured_image_by_gwyddion_is_what_the_vendors_package_reads():
-    package = pytest.importorskip("NSFopen.read")
-    pytest.importorskip("gwyddionpy")
-    examples = Path(pytest.importorskip("NSFopen").__file__).parent / "example"
-    image, friction = examples / "Plotting_Data" / "MoS2.nid", examples / "Lateral_Force" / "SBS-PMMA.nid"
-    if not (image.exists() and friction.exists()):
-        pytest.skip("this release of NSFopen comes without its examples")
-    theirs = package.read(str(image)).data["Image"]["Forward"]
-    found = read_images(image)
-    # Gwyddion counts rows from above
-    for ours, name in ((found.amplitude, "Amplitude"), (found.phase_deg, "Phase")):
-        wanted = np.asarray(theirs[name])
-        assert any(np.allclose(ours, rows, rtol=1e-6, atol=1e-9) for rows in (wanted, wanted[::-1]))
-    assert found.in_volts
-    assert found.known["drive_frequency_khz"].value == 172.823
-    with pytest.raises(TableError, match=r"the mode 'Lateral Force' \(Op\. mode\)"):
-        read_images(friction)
-
-
 def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
     zarr = pytest.importorskip("zarr")
     (path,) = written(tmp_path, "gwy")
