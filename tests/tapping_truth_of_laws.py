@@ -137,7 +137,7 @@ def curve_like_graphite(rows: int = 150) -> Truth:
 
 
 def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsive: np.ndarray) -> Truth:
-    """Return the curve on resonance of given energies over the tip's amplitude: the lag balances them, harmonics too."""
+    """Return the curve on resonance of given energies over the amplitude: the lag balances them, harmonics too."""
     amplitude, lag, n = ratio * tip.free_nm, np.full(len(ratio), 90.0), np.arange(2, 41)[:, None]
     tap = np.pi * tip.stiffness
     for _ in range(60):

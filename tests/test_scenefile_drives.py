@@ -103,19 +103,3 @@ def test_a_drive_is_as_strong_as_the_free_tips_amplitude_says(path: Path, ratio:
     force: Any = loaded(path, CANTILEVER, RESTING, "[force]\n", lines, LAW).force
     assert float(base.amplitude_nm) == pytest.approx(size, rel=1e-12)
     assert float(force.amplitude_nn) == pytest.approx(size * (2e-3 * np.pi * 90.0) ** 2, rel=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["base", "force"])
-def test_a_second_tone_is_given_by_what_it_makes_of_the_free_tip(path: Path, kind: str):
-    first, second = {"base": (BASE, BASE_SECOND), "force": (FORCE, FORCE_SECOND)}[kind]
-    _, _, rest = second.partition("\n")[2].partition("\n")
-    scene = loaded(path, CANTILEVER, RESTING, first, f"[{kind}.second]\nfree_amplitude_nm = 2\n{rest}", NONE)
-    ratio = {"base": 4.0, "force": 5.0}[kind]
-    # k |1 - s^2 + i s/Q| A: of a force with m = 1 ng; of a base without k
-    size = 2.0 * abs(1.0 - ratio**2 + 1j * ratio / 40.0)
-    stiffness = {"base": 1.0, "force": (2e-3 * np.pi * 90.0) ** 2}[kind]
-    tone = getattr(scene, kind).second
-    assert float(tone.amplitude) == pytest.approx(stiffness * size, rel=1e-12)
-    assert float(tone.frequency_khz) == pytest.approx(90.0 * ratio, rel=1e-15)
-    with pytest.raises(ValueError, match="has both"):
-        loaded(path, CANTILEVER, RESTING, first, f"{second}free_amplitude_nm = 2\n", NONE)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, in_blocks, map_in_blocks, power_of_two
@@ -253,22 +251,3 @@ def test_quadrature_of_polynomials_is_exact():
     # P_4 of 2 x - 1 begins with 70 x^4
     assert float(series_tail(jnp.asarray(points**3))) == pytest.approx(1.0 / 20.0, rel=1e-13)
     assert float(series_tail(jnp.asarray(70.0 * points**4 - 140.0 * points**3))) == pytest.approx(1.0, rel=1e-12)
-
-
-@pytest.mark.slow
-def test_slopes_of_a_contacts_table_do_not_hang_on_how_its_barrier_is_rounded():
-    # the barrier is the largest of many energies: computed twice by an XLA told to hurry, none was the largest
-    def table(humidity):
-        return tabulated(Contact.paper(relative_humidity=humidity), jnp.asarray(1.0)).lowest
-
-    def both(humidity):
-        return jax.jvp(table, (humidity,), (jnp.asarray(1.0),))
-
-    hurried = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
-    try:
-        quick = jax.jit(both, compiler_options=hurried).lower(0.5).compile()
-    except jax.errors.JaxRuntimeError:
-        pytest.skip("this XLA does not know the options")
-    for humidity in (0.499, 0.49975, 0.501):
-        near = [float(quick(jnp.asarray(humidity + shift))[0]) for shift in (-1e-4, 1e-4)]
-        assert float(quick(jnp.asarray(humidity))[1]) == pytest.approx((near[1] - near[0]) / 2e-4, rel=1e-5)

@@ -1,4 +1,4 @@
-"""Collisions of any number of tips are compiled in time: chains of steps that Python writes out take compilers hours."""
+"""Collisions of any number of tips are compiled in time: steps that Python writes out take compilers hours."""
 
 import pytest
 
