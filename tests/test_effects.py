@@ -56,7 +56,7 @@ def size_of(change: Change) -> float:
 
 @pytest.fixture(scope="module")
 def law_study():
-    return study_effects(law_scene(), accuracy=ACCURACY)
+    return study_effects(law_scene(), accuracy=ACCURACY, only=list(WITHOUT))
 
 
 @pytest.mark.slow
@@ -67,9 +67,6 @@ def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_st
     # the orbit is closed to 1e-9 of the speed; weakly attracting orbits are then known to some 1e-7
     found = np.array([*amplitudes(change), change.energy_per_impact])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
-    if name == "delay_corrections":
-        # 0.2-0.7 % is what the corrections are there for
-        assert 1e-3 < np.abs(expected[:2]).max() < 1e-2
 
 
 @pytest.mark.slow
@@ -147,17 +144,15 @@ def test_a_scene_pays_only_for_its_effects():
 
 
 @pytest.mark.slow
-def test_forces_of_no_or_hardly_any_strength_are_dropped_and_those_of_the_junction_required():
-    contact = Contact.paper(structural_amplitude_n_per_m=0.0, viscosity_pa_s=1e-9)
-    scene = Scene(Cantilever(90.0, 40.0), DRIVE, contact)
-    names = ["structural", "core", "viscous", "jkr"]
+def test_a_force_of_no_strength_is_dropped_and_those_of_the_junction_required():
+    scene = Scene(Cantilever(90.0, 40.0), DRIVE, Contact.paper(structural_amplitude_n_per_m=0.0))
+    names = ["structural", "core", "jkr"]
     study = study_effects(scene, start_of(scene, (270.0, 5.0, 60.0)), accuracy=0.01, only=names)
     reports, reduction = by_name(study), study.reduction
     # two programs for one motion: rounding, and the accuracy of 1e-9 to which the orbit is closed
     assert size_of(reports["structural"].change) < 1e-7
-    assert size_of(reports["viscous"].change) < 1e-4
-    assert set(reduction.left_out) == {"structural", "viscous"}
-    assert reduction.scene.interaction.effects == ("capillary", "core", "jkr")
+    assert reduction.left_out == ("structural",)
+    assert reduction.scene.interaction.effects == ("capillary", "core", "viscous", "jkr")
     for cost in (reports["structural"].cost, reduction.cost):
         assert cost != study.cost
     for name in ("core", "jkr"):
