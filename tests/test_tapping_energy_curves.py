@@ -169,26 +169,21 @@ def test_an_instrument_that_no_energy_allows_contradicts_the_curve():
     assert "of its errors from what was given would be needed" in torn.reasons[0]
 
 
-def fits_of_a_drift(phase: float, amplitude: float, rows: int, seed: int, *, way_back: bool) -> tuple[Tapping, Tapping]:
-    """Return the fit of rows in order of time, which must be right, and that of rows in an order that is not known."""
-    truth, stated = one_energy(rows), Stated(stiffness=1e-4, phase_noise_deg=0.2)
-    drifts = {"phase_drift_deg": phase, "amplitude_drift": amplitude, "back": truth if way_back else None}
-    table = table_of(Tip(), truth, stated, np.random.default_rng(seed), **drifts, rows_in_order_of_time=True)
+@pytest.mark.parametrize(("phase", "amplitude"), [(5.0, 0.0), (0.0, 0.03)])
+def test_a_drift_along_the_rows_is_fitted_where_their_order_is_known_and_else_said(phase: float, amplitude: float):
+    truth, stated = one_energy(40), Stated(stiffness=1e-4, phase_noise_deg=0.2)
+    drifts = {"phase_drift_deg": phase, "amplitude_drift": amplitude, "back": truth}
+    table = table_of(Tip(), truth, stated, np.random.default_rng(7), **drifts, rows_in_order_of_time=True)
     result = tapping(table, law=False)
     assert result.valid, result.reasons
     low, high = result.energy["interval95"]
     assert low < ONE_ENERGY_AJ < high
     assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
-    return result, tapping(replace(table, rows_in_order_of_time=False), law=False)
-
-
-@pytest.mark.parametrize(("phase", "amplitude"), [(5.0, 0.0), (0.0, 0.03)])
-def test_a_drift_along_the_rows_is_fitted_where_their_order_is_known_and_else_said(phase: float, amplitude: float):
-    result, blind = fits_of_a_drift(phase, amplitude, 40, 7, way_back=True)
     assert result.functions is not None
     found = {one.kind: one for one in result.functions.nuisances}
     for name, true in (("phase_drift_deg", phase), ("free_amplitude_drift", amplitude)):
         assert abs(found[name].value - true) < 3.5 * found[name].standard_error
+    blind = tapping(replace(table, rows_in_order_of_time=False), law=False)
     assert not blind.valid
     assert "# rows = in order of time" in blind.reasons[0]
 
