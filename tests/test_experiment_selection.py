@@ -1,4 +1,4 @@
-"""Choosing points by their information: against exhaustive search, textbook designs and plain matrix algebra."""
+"""Choosing points by their information: against exhaustive search and plain matrix algebra."""
 
 import itertools
 

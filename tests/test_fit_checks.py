@@ -1,4 +1,4 @@
-"""What is said of a minimum: distance, bounds, the share of Q in the errors, the band of the law."""
+"""What is said of a minimum: distance, bounds, the band of the law."""
 
 import dataclasses
 

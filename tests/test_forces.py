@@ -1,4 +1,4 @@
-"""Every force against its formula in mpmath, and its potential against the force; sums; bad parameters."""
+"""Every force against its formula in mpmath, and its potential against the force."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Orbits of impacts that last: limits, a dense scan in NumPy, close pairs, and following from one to the next."""
+"""Orbits of impacts that last: limits, a dense scan in NumPy, close pairs."""
 
 import itertools
 

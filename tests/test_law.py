@@ -1,4 +1,4 @@
-"""The impact law: energies, limits, its inverse and its slopes."""
+"""The impact law: its values, its inverse and its slopes."""
 
 import jax
 import mpmath

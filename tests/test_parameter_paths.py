@@ -1,4 +1,4 @@
-"""Parameters by their paths in a scene file: what ranges may be, and what scenes become."""
+"""Parameters by their paths in a scene file: what scenes become."""
 
 import jax
 import numpy as np

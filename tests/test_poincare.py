@@ -1,4 +1,4 @@
-"""The impact map: against 50 digits, its limits and symmetries, and how a sequence of impacts ends."""
+"""The impact map: against 50 digits, its limits, and how a sequence of impacts ends."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The posterior against quadrature of another program's amplitudes and importance sampling."""
+"""The posterior against another program's amplitudes and importance sampling."""
 
 import dataclasses
 

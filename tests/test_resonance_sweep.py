@@ -1,4 +1,4 @@
-"""Reading resonance sweeps: both forms, and every fault as one line that says what, where and how to mend it."""
+"""Reading resonance sweeps in both forms."""
 
 from pathlib import Path
 

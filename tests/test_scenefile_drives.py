@@ -1,4 +1,4 @@
-"""Scene files with drives of base and tip and second frequencies: exact loops, and one line for every mistake."""
+"""Scene files with drives of base and tip and second frequencies: every key and exact loops."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The start of a scene file: kept exactly, and not saved where a tip cannot begin."""
+"""The start of a scene file: kept exactly."""
 
 from pathlib import Path
 

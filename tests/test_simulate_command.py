@@ -1,4 +1,4 @@
-"""`afm-jax simulate`: its numbers against orbits of the impact law, its files, and its refusals."""
+"""`afm-jax simulate`: its numbers against orbits of the impact law, and its files."""
 
 from pathlib import Path
 from typing import Any

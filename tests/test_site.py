@@ -1,4 +1,4 @@
-"""The site: whole, strict, nothing fetched from other machines; its search works in a browser."""
+"""The site: whole, strict, nothing fetched from other machines."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""The surface that a tip sees: derivatives, bounds, what it costs, and where there is none."""
+"""The surface that a tip sees: derivatives, bounds, and where there is none."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Sweeps for real: against the functions they record, over devices and processes, killed, on a full disk."""
+"""Sweeps for real: against the functions they record, over processes, and points without a result."""
 
 import json
 import os

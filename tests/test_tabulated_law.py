@@ -1,4 +1,4 @@
-"""A law as a table: the same impacts, orbits and motions as the formula it was made of; what is no table."""
+"""A law as a table: the same impacts, orbits and motions as the formula it was made of."""
 
 import jax
 import jax.numpy as jnp

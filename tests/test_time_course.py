@@ -1,4 +1,4 @@
-"""The time course of one impact against SciPy in time, against `collide`, and its captured and soft cases."""
+"""The time course of one impact against SciPy in time, against `collide`, and its soft case."""
 
 import numpy as np
 import pytest
