@@ -105,7 +105,7 @@ bands: $(SETUP) ## do 95 % bands hold the laws of ten random contacts, intervals
 	$(BIN)/python -m tests.coverage_of_bands
 	$(BIN)/python -m tests.coverage_of_bands --intervals
 
-tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--model contact")
+tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--contacts 0:20")
 	$(BIN)/python -m tests.tapping_accuracy $(TAPPING)
 
 ENERGIES ?= --curves 200 --shaped 75

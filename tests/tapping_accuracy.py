@@ -1,14 +1,12 @@
 """Tapping curves of random contacts: what is predicted of them, and what whole fits of them give back.
 
-    python -m tests.tapping_accuracy [--contacts 0:6] [--seeds 2] [--truths FOLDER] [--model contact]
+    python -m tests.tapping_accuracy [--contacts 0:6] [--seeds 2] [--truths FOLDER]
 
 The truth is the full scene in time, kept in the folder. Forward: amplitude and lag that the contact's own table of
 collisions predicts, at speeds of 4 times the capture speed and more and pulls below 0.8 times what turns the tip round.
 Fits: two free amplitudes 3 % above resonance, without noise and with 0.3 % and 0.2 degrees, frequency, Q, calibration,
 origin and zero of phase free within their errors. `make tapping` runs it; the exit status is 1 if less is reached than
 is wanted. Contacts whose law is refused (too few fast impacts) or whose fit is not valid are counted.
-With `--model contact` the contact itself is fitted to noisy curves 3 % above resonance, the tip's radius and
-the humidity known.
 """
 
 import argparse
@@ -29,12 +27,10 @@ from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
 from fitting.infer.fit import fit
 from fitting.infer.result import FitResult
-from fitting.report.words import interval_in_words
 from fitting.simulated.experiment import with_noise
 from fitting.tables.table import AmplitudeTable
 from tests.tapping_truths import MASS_NG, SHARES, TappingTruth, as_measured, exact_table, tapping_truth
 
-MODEL = "viscous+delay"
 RATIO, HIGHER_RATIO = 1.03, 1.1
 FASTER, LONGEST_PULL = 4.0, 0.8
 FEW_SHARES = tuple(np.linspace(0.88, 0.16, 8).tolist())
@@ -110,7 +106,7 @@ class Fitted(NamedTuple):
 
 def fitted(truth: TappingTruth, table: AmplitudeTable) -> Fitted | None:
     """Return what a valid fit gives; None where the law is refused or the fit says that it is not valid."""
-    result = fit(table, MODEL)
+    result = fit(table, "viscous+delay")
     return against_truth(truth, result) if result.valid else None
 
 
@@ -182,40 +178,15 @@ def judge_fits(name: str, fits: list[Fitted], *, exact: bool) -> int:
     return _judge(line, {f"{100 * MEDIAN_LAW} % in the median": median <= MEDIAN_LAW, "at worst": worst <= WORST_LAW})
 
 
-def judge_contacts(truths: list[TappingTruth], seeds: int, folder: Path) -> int:
-    """Print what fits of the contact give above resonance; return how much is not as wanted."""
-    missed = 0
-    for truth in truths:
-        exact = as_measured(exact_table(truth, RATIO, folder))
-        for seed in range(seeds):
-            result = contact_of(truth, noisy(exact, truth, seed))
-            found = against_truth(truth, result)
-            worst = np.nan if found is None else float(np.abs(found.law).max())
-            said = [
-                f"{name} {one.value:.4g} ({interval_in_words(one)}; truth {truth.parameters[name]:g})"
-                for name, one in result.parameters.items()
-                if name in truth.parameters
-            ]
-            said.append(f"{int(result.rows.used.sum())} of {exact.rows} rows")
-            line = f"contact {truth.number}, seed {seed}: law {100 * worst:.2f} % at worst; "
-            line += "; ".join(said + result.reasons)
-            tests = {"valid": result.valid, f"{100 * WORST_OF_CONTACT:g} %": worst <= WORST_OF_CONTACT}
-            missed += _judge(line, tests)
-    return missed
-
-
 def main() -> int:
     """Measure, print and judge."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
     parser.add_argument("--contacts", default="0:6", help="numbers of the random contacts, first:end")
     parser.add_argument("--seeds", type=int, default=2, help="noisy tables of each contact")
     parser.add_argument("--truths", type=Path, default=Path(tempfile.gettempdir()) / "afm-jax-truths")
-    parser.add_argument("--model", choices=(MODEL, "contact"), default=MODEL)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     truths = [tapping_truth(number) for number in range(*map(int, options.contacts.split(":")))]
-    if options.model == "contact":
-        return 1 if judge_contacts(truths, options.seeds, options.truths) else 0
     missed = 0
     for ratio, shares in ((RATIO, SHARES), (HIGHER_RATIO, FEW_SHARES)):
         parts = [forward(truth, exact_table(truth, ratio, options.truths, shares)) for truth in truths]

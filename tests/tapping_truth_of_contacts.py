@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from tests.tapping_truth_of_laws import Tip, Truth
+from tests.tapping_truth_of_laws import Tip, Truth, truth_of
 
 FOLDER = Path(__file__).with_name("tapping_tables")
 VISCOSITIES = (100.0, 400.0)
@@ -29,8 +29,6 @@ def path_of(viscosity: float, ratio: float) -> Path:
 def curve_of_contact(viscosity: float, ratio: float, drive: str, rows: int = 100) -> tuple[Tip, Truth]:
     """Return the cantilever of a curve and what it does in contact, simulated where the curve is not kept.
 
-    A base that shakes moves the tip as a force on it does; what is read is the deflection, D = Z + gamma A0.
-
     Args:
         viscosity: of the bridge, over that of the paper's water.
         ratio: drive over free frequency.
@@ -44,11 +42,7 @@ def curve_of_contact(viscosity: float, ratio: float, drive: str, rows: int = 100
     height = np.linspace(kept[0, 0], kept[-1, 0], rows)
     amplitude, lag, energy = CubicSpline(kept[:, 0], kept[:, 1:])(height).T
     tip = Tip(ratio=ratio, drive=drive)
-    z = -amplitude * np.exp(-1j * (np.radians(lag) - np.angle(tip.gamma)))
-    virial = 0.5 * tip.stiffness * np.real(tip.gamma * (z + tip.free_nm) * np.conj(z))
-    seen = z if drive == "force" else z + tip.gamma * tip.free_nm
-    lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
-    return tip, Truth(height, np.abs(seen), lag, energy, virial)
+    return tip, truth_of(tip, height, amplitude, lag, energy)
 
 
 def _simulate(path: Path, viscosity: float, ratio: float) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.tapping_truth_of_laws import RAD_PER_US, Tip, Truth
+from tests.tapping_truth_of_laws import RAD_PER_US, Tip, Truth, truth_of
 
 FOLDER = Path(__file__).with_name("tapping_tables")
 QUALITIES, RATIOS = (150.0, 400.0), (0.99, 1.0, 1.03, 1.05)
@@ -36,18 +36,11 @@ def path_of(sample: str, quality: float, ratio: float) -> Path:
 
 
 def curve_of_force(sample: str, quality: float, ratio: float, drive: str) -> tuple[Tip, Truth]:
-    """Return the cantilever of a curve and what it does, row by row.
-
-    A base that shakes moves the tip as a force on it does; what is read is the deflection, D = Z + gamma A0.
-    """
+    """Return the cantilever of a curve and what it does, row by row."""
     kept = np.loadtxt(path_of(sample, quality, ratio), delimiter=",", skiprows=1)
     height, amplitude, lag, energy = kept.T
     tip = Tip(FREE_NM, ratio, quality, STIFFNESS, FREQUENCY_KHZ, drive)
-    z = -amplitude * np.exp(-1j * (np.radians(lag) - np.angle(tip.gamma)))
-    virial = 0.5 * tip.stiffness * np.real(tip.gamma * (z + tip.free_nm) * np.conj(z))
-    seen = z if drive == "force" else z + tip.gamma * tip.free_nm
-    lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
-    return tip, Truth(height, np.abs(seen), lag, energy, virial)
+    return tip, truth_of(tip, height, amplitude, lag, energy)
 
 
 def simulate(sample: str) -> None:

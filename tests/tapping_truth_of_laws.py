@@ -57,6 +57,18 @@ class Truth(NamedTuple):
         return np.interp(ratio, self.amplitude_nm[order] / free, getattr(self, column)[order])
 
 
+def truth_of(tip: Tip, height: np.ndarray, amplitude: np.ndarray, lag: np.ndarray, energy: np.ndarray) -> Truth:
+    """Return what is read of a tip that moves with an amplitude and a lag behind a force, and its virial.
+
+    A base that shakes moves the tip as a force on it does; what is read is the deflection, D = Z + gamma A0.
+    """
+    z = -amplitude * np.exp(-1j * (np.radians(lag) - np.angle(tip.gamma)))
+    virial = 0.5 * tip.stiffness * np.real(tip.gamma * (z + tip.free_nm) * np.conj(z))
+    seen = z if tip.drive == "force" else z + tip.gamma * tip.free_nm
+    lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
+    return Truth(height, np.abs(seen), lag, energy, virial)
+
+
 def curve_of_law(tip: Tip, heights_nm: np.ndarray, rebound: Callable[[np.ndarray], np.ndarray]) -> Truth:
     """Return the curve of a law: the fastest impact a period whose flight stays above the sample; rows without go."""
     free, own = tip.free_nm, RAD_PER_US * tip.frequency_khz
@@ -125,10 +137,7 @@ def curve_like_graphite(rows: int = 150) -> Truth:
 
 
 def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsive: np.ndarray) -> Truth:
-    """Return the curve on resonance of given energies over the tip's amplitude: the lag balances them, harmonics too.
-
-    A base that shakes moves the tip as a force on it does; what is read is the deflection, D = Z + gamma A0.
-    """
+    """Return the curve on resonance of given energies over the amplitude: the lag balances them, harmonics too."""
     amplitude, lag, n = ratio * tip.free_nm, np.full(len(ratio), 90.0), np.arange(2, 41)[:, None]
     tap = np.pi * tip.stiffness
     for _ in range(60):
@@ -138,12 +147,7 @@ def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsiv
         sine = ((energy_aj + lost) / (tap * amplitude) + amplitude / tip.quality) / (tip.free_nm / tip.quality)
         lag = np.degrees(np.arcsin(np.minimum(sine, 1.0)))
         lag = np.where(repulsive, lag, 180.0 - lag)
-    virial = -tap / np.pi * amplitude * tip.free_nm / (2.0 * tip.quality) * np.cos(np.radians(lag))
-    if tip.drive == "force":
-        return Truth(-amplitude, amplitude, lag, energy_aj, virial)
-    seen = -amplitude * np.exp(-1j * np.radians(lag - 90.0)) + tip.gamma * tip.free_nm
-    lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
-    return Truth(-amplitude, np.abs(seen), lag, energy_aj, virial)
+    return truth_of(tip, -amplitude, amplitude, lag, energy_aj)
 
 
 class Stated(NamedTuple):

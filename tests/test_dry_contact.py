@@ -104,9 +104,8 @@ def test_the_ledger_closes_with_drag_alone_and_the_slowest_tip_is_captured():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effects", [["van_der_waals", "viscous", "dmt"], ["hertz"]])
-def test_derivatives_forward_and_reverse_are_central_differences(effects):
-    names = ["modulus_gpa", "tip_radius_nm"] if "hertz" in effects else list(DRY)
+def test_derivatives_forward_and_reverse_are_central_differences():
+    names, effects = list(DRY), ["van_der_waals", "viscous", "dmt"]
     start = jnp.array([DRY[name] for name in names] + [25.0])
 
     def outputs(values):
@@ -134,14 +133,11 @@ def test_law_of_a_dry_contact_gives_back_the_speed():
     assert law.r == pytest.approx(1.0, abs=1e-9)
 
 
-SCENE = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), Contact(VanDerWaals() + Viscous(), Dmt()))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("contact", [SCENE.interaction, Contact((), Hertz())], ids=["dmt", "hertz"])
-def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(contact):
-    scene = Scene(SCENE.cantilever, SCENE.platform, contact)
-    simulation = simulate(scene, default_start(scene), 4.5 * float(SCENE.platform.period_us), max_contacts=16)
+def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them():
+    contact = Contact(VanDerWaals() + Viscous(), Dmt())
+    scene = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), contact)
+    simulation = simulate(scene, default_start(scene), 4.5 * float(scene.platform.period_us), max_contacts=16)
     assert int(simulation.outcome) == MotionOutcome.FINISHED
     rows = simulation.contacts
     assert rows.detail is not None

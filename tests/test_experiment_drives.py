@@ -1,14 +1,12 @@
 """What can be driven: grids, and the lists of the command line."""
 
-from typing import Any
-
 import click
 import numpy as np
 import pytest
 
 from afm_jax.cli.values import Numbers, Orders, ValueAndError
 from fitting import prior_of_values
-from fitting.experiments.candidates import drive_grid, same_drives
+from fitting.experiments.candidates import drive_grid
 
 
 def test_detunings_are_about_each_orders_resonance_and_every_combination_is_there_once():
@@ -19,23 +17,6 @@ def test_detunings_are_about_each_orders_resonance_and_every_combination_is_ther
     # 2 N f0 times the detuning
     places = [(1, 174.6), (1, 180.0), (3, 523.8), (3, 540.0)]
     assert found == [(*place, drive, offset) for place in places for drive in (2.0, 4.0) for offset in (-1.0, 1.0)]
-
-
-def test_faults_are_named():
-    for changes, fault in (
-        ({"orders": (1.5,)}, "whole numbers"),
-        ({"offsets_nm": (float("nan"),)}, "`offsets_nm` must be a finite number, but is nan"),
-    ):
-        given: Any = {"orders": (1,), "amplitudes_nm": (2.0,), "detunings": (1.0,)} | changes
-        with pytest.raises(ValueError, match=fault):
-            drive_grid(**given, free_frequency_khz=90.0)
-
-
-def test_measured_drives_are_recognised_up_to_rounding():
-    lists = {"orders": (1, 2), "amplitudes_nm": (0.3,), "detunings": (1.0, 181.0 / 180.0), "offsets_nm": (0.0,)}
-    drives = drive_grid(**lists, free_frequency_khz=90.0)
-    measured = np.array([[1, 180.0 + 1e-9, 0.1 + 0.2, -0.0]])
-    assert same_drives(drives, measured).tolist() == [True, False, False, False]
 
 
 def test_lists_and_errors_are_read():

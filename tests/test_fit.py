@@ -8,7 +8,6 @@ from scipy.stats import chi2
 from afm_jax import ImpactLaw
 from fitting import fit
 from fitting.examples.make_amplitudes import TRUTH, example_table
-from fitting.report.report import summary
 from tests.fit_tables import (
     amplitudes_and_errors,
     chi2_residuals,
@@ -20,8 +19,6 @@ from tests.fit_tables import (
     values_of,
     with_amplitudes,
 )
-from tests.reference_examples import scene
-from tests.reference_orbits import single_impact_orbits
 
 __all__ = ["law", "table"]
 
@@ -35,18 +32,6 @@ def test_the_bundled_table_is_what_its_script_makes(table):
         last_digit = 10.0 ** (np.floor(np.log10(stored)) - 4.0)
         assert np.all(np.abs(ours - stored) < 1.5 * last_digit)
         assert np.mean(ours != stored) < 0.1
-
-
-def test_the_bundled_table_is_the_reference_with_one_per_cent_noise(table):
-    for row in (0, 30, 60):
-        drive, frequency = float(table.drive_amplitude_nm[row]), float(table.drive_frequency_khz[row])
-        truth = scene(frequency / 180.0, amplitude_nm=drive, offset_nm=float(table.offset_nm[row]), **TRUTH)
-        (orbit,) = [o for o in single_impact_orbits(truth, int(table.order[row])) if o.stable and o.admissible]
-        for kind in ("peak", "lockin"):
-            exact = getattr(orbit, f"{kind}_amplitude_nm")
-            error = getattr(table, f"{kind}_amplitude_error_nm")[row]
-            assert error == pytest.approx(0.01 * exact, rel=5.1e-5)  # written with five digits
-            assert abs(getattr(table, f"{kind}_amplitude_nm")[row] - exact) < 4.0 * error
 
 
 def test_the_truth_lies_in_the_intervals(law):
@@ -81,19 +66,6 @@ def test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84(law, tab
             scipy = least_squares(residual, np.delete(values_of(law), index), x_scale=scale, xtol=1e-10)
             # the search stops within a thousandth of the rise
             assert 2.0 * scipy.cost - law.chi2 == pytest.approx(3.8415, rel=5e-3)
-
-
-@pytest.mark.slow
-def test_a_full_law_with_one_loss_held_is_the_law_without_it(table, law):
-    """u_out^2 = r^2 u_in^2 - c u_in - epsilon is eq. 6 at c = 0."""
-    full = fit(table, "full", fixed={"viscous_loss": 0.0})
-    np.testing.assert_allclose(values_of(full), values_of(law), rtol=1e-6)
-    assert full.chi2 == pytest.approx(law.chi2, rel=1e-9)
-    # the law that is shown holds the value, too
-    speed, r = full.law.approach_speed_nm_per_us, full.parameters["r"].value
-    square = (r * speed) ** 2 - full.parameters["epsilon"].value
-    np.testing.assert_allclose(full.law.rebound_speed_nm_per_us, np.sqrt(square), rtol=1e-12)
-    assert "Held fixed: viscous_loss = 0 nm/us" in summary(full)
 
 
 @pytest.mark.slow

@@ -65,23 +65,6 @@ def test_a_wrong_calibration_of_drive_and_offsets_is_found(table):
         assert abs(result.parameters[name].value - value) < 3.0 * (result.parameters[name].standard_error or 0.0)
 
 
-SAME = "offset_origin_nm and delay_offset_nm shift the same thing"
-
-
-@pytest.mark.parametrize(
-    ("model", "changes", "constraints", "said"),
-    [
-        ("law", {}, {"tip_calibration": (float("nan"), 0.1)}, "must be a value and a positive error"),
-        ("law", {}, {"viscous_loss": (1.0, 0.1)}, "is on no parameter: choose from r, epsilon, quality_factor"),
-        ("law+delay", {}, {"offset_origin_nm": (0.0, 0.3)}, SAME),
-        ("viscous+delay", {"calibration": {"offset_origin_nm": (0.0, 0.3)}}, {}, SAME),
-    ],
-)
-def test_impossible_constraints_are_errors(table, model, changes, constraints, said):
-    with pytest.raises(ValueError, match=said):
-        fit(dataclasses.replace(table, **changes), model=model, constraints=constraints)
-
-
 def with_unseen(table: AmplitudeTable, drive_nm: float) -> AmplitudeTable:
     """Return a table with its last row once more, at another drive, on which no orbit was seen."""
     columns = {name: np.append(np.asarray(getattr(table, name)), np.nan) for name in AMPLITUDES}
@@ -89,15 +72,6 @@ def with_unseen(table: AmplitudeTable, drive_nm: float) -> AmplitudeTable:
     columns["no_orbit"] = np.append(np.zeros(table.rows), 1.0)
     again = np.append(np.arange(table.rows), -1)
     return rows(table, again, **columns, lines=np.arange(1, table.rows + 2))
-
-
-def test_a_drive_too_small_for_an_orbit_agrees_with_the_law(table, plain):
-    result = fit(with_unseen(table, 0.05), model="law")
-    assert result.valid
-    assert result.chi2 == pytest.approx(plain.chi2, rel=1e-9)
-    assert result.degrees_of_freedom == plain.degrees_of_freedom + 1
-    assert np.all(np.abs(values_of(result) - values_of(plain)) < 1e-4 * standard_errors_of(plain))
-    assert np.isnan(result.rows.predicted_nm[-1]).all()
 
 
 def test_an_orbit_that_was_not_seen_counts_three_errors(table, plain):

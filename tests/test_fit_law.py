@@ -6,7 +6,6 @@ from scipy.optimize import minimize
 
 from afm_jax import Contact, ImpactLaw, find_junction
 from fitting import delay_of_contact, law_of_contact
-from tests.answers import answer, table
 from tests.reference_contact import ContactParameters, collision
 
 PAPER = Contact.paper()
@@ -66,15 +65,6 @@ def test_no_other_law_is_closer(model: str):
     np.testing.assert_allclose(told, (np.abs(own).max(), np.sqrt(np.mean(own**2))), rtol=1e-10, atol=0.0)
 
 
-def test_impossible_fits_are_named():
-    with pytest.raises(ValueError, match="`points` must be at least the number of parameters, 3, but is 2"):
-        delay_of_contact(PAPER, points=2)
-    with pytest.raises(ValueError, match="must rise between two positive speeds"):
-        law_of_contact(PAPER, speed_range=(float("nan"), 20.0))
-    with pytest.raises(ValueError, match=r"is 405\.\d+ to 250 \(the capture speed is 270\.?\d* nm/us\)"):
-        law_of_contact(Contact.paper(viscosity_pa_s=1.0))
-
-
 @pytest.fixture(scope="module")
 def delay():
     return delay_of_contact(PAPER, speed_range=(15.0, 700.0))
@@ -119,20 +109,3 @@ def test_delay_law_is_the_published_one(delay):
     np.testing.assert_allclose(np.asarray(law(u, w)), delay.fitted_us, rtol=0.0, atol=1e-15)
     published = 0.206 * u**-0.2 - 5.64 * (1.0 / w - 1.0 / u) - 0.726 / u
     assert delay.rms_us < np.sqrt(np.mean((published - delay.delay_us) ** 2)) < 1.1 * delay.rms_us
-
-
-def test_command_tells_what_the_functions_find(tmp_path):
-    payload = answer(tmp_path, "collide", "--make-law")
-    assert [row["model"] for row in payload["models"]] == ["law", "viscous", "full"]
-    rows = table(tmp_path / "law_models.csv")
-    assert len(rows) == payload["points"] == 512
-    (told,) = (row for row in payload["models"] if row["model"] == "law")
-    law = law_of_contact(PAPER)
-    assert all(value == getattr(law, name) for name, value in told.items())
-    fitted = [float(row["law_speed_nm_per_us"]) / float(row["rebound_speed_nm_per_us"]) for row in rows]
-    worst = np.abs(np.array(fitted) - 1.0).max()
-    np.testing.assert_allclose(worst, law.worst_relative_error, rtol=1e-9, atol=0.0)
-    delays = table(tmp_path / "law_delay.csv")
-    delay = delay_of_contact(PAPER)
-    assert [float(row["lag_us"]) for row in delays] == delay.lag_us.tolist()
-    assert payload["delay"]["lead_nm"] == float(delay.delay.lead_nm)

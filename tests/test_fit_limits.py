@@ -9,12 +9,8 @@ from scipy.optimize import least_squares
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit
 from fitting.infer import fit as fitting_fit
-from fitting.infer.fit import model_of
 from fitting.infer.instantaneous import Chi2
 from fitting.infer.result import FitResult
-from fitting.infer.search import orbits_at
-from fitting.infer.unknowns import Model, no_orbits
-from fitting.models import task_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -116,28 +112,6 @@ def test_blank_cells_weigh_as_much_as_infinite_errors(few):
     np.testing.assert_allclose(standard_errors_of(result), standard_errors_of(vague), rtol=1e-6)
     assert result.degrees_of_freedom == vague.degrees_of_freedom - 20
     np.testing.assert_array_equal(np.isnan(result.rows.residual), blank)
-
-
-def test_the_order_of_the_rows_does_not_matter(few, fit_of_few):
-    first, second = fit_of_few, fit(rows(few, np.random.default_rng(7).permutation(30)), model="law")
-    assert second.chi2 == pytest.approx(first.chi2, rel=1e-9)
-    assert np.all(np.abs(values_of(second) - values_of(first)) < 1e-4 * standard_errors_of(first))
-
-
-@pytest.mark.parametrize(
-    ("measured", "slot"), [((100.0, 40.0), 0), ((61.0, 40.0), 2), ((np.nan, 26.0), 2), ((61.0, np.nan), 2)]
-)
-def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, measured, slot):
-    """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
-    steady = np.array([True, False, True, False])
-    readings = np.array([[100.0, 40.0, 0.0], [60.0, 26.0, 0.0], [60.0, 25.0, 0.0], [61.0, 40.0, 0.0]])
-    made_up = no_orbits(4)._replace(steady=steady, readings=readings, approach=np.arange(1.0, 5.0))
-    monkeypatch.setattr(Model, "candidates", lambda *_, **__: (np.zeros(4, int), made_up))
-    error = np.where(np.isnan(measured), np.nan, 1.0)[None]
-    one = with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error)
-    found = orbits_at(model_of(one, task_of(one, "law"), {"fixed": {}, "held": ()}), np.array([0.1, 60.0, 0.0]))
-    assert found.orbits.approach[0] == 1.0 + slot
-    assert found.number[0] == 2
 
 
 @pytest.mark.slow

@@ -1,16 +1,15 @@
-"""Every force against its formula in mpmath, and its potential against the force; sums; bad parameters."""
+"""Every force against its formula in mpmath, and its potential against the force."""
 
 import itertools
 
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from afm_jax.contact.contact import Contact, bridge_of
-from afm_jax.contact.forces import Capillary, CoreRepulsion, ForceSum, Jkr, Liquid, Structural, VanDerWaals, Viscous
+from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, Liquid, Structural, VanDerWaals, Viscous
 from afm_jax.contact.forces import jkr as jkr_formulas
 from tests.reference_contact_forces import ContactParameters, constants, static_force, static_potential
 
@@ -60,23 +59,6 @@ def test_viscous_force_of_water_is_the_number_of_the_unit_page():
 
 def test_kelvin_radius_is_054_nm_over_ln_2():
     assert float(Liquid().kelvin_radius_nm) == pytest.approx(0.54 / np.log(2.0), rel=1e-6)  # V_m has 6 digits
-
-
-@settings(max_examples=20)
-@given(
-    st.permutations([Capillary(), Structural(), CoreRepulsion(), Viscous()]),
-    st.floats(0.1, 5.0),
-    st.floats(-99.0, 99.0),
-)
-def test_a_sum_does_not_depend_on_order_or_brackets(forces, gap, rate):
-    a, b, c, d = forces
-    left, right = ((a + b) + c) + d, a + (b + (c + d))
-    assert isinstance(left, ForceSum)
-    assert left.terms == right.terms
-    parts = [float(force(gap, rate)) for force in forces]
-    assert float(left(gap, rate)) == pytest.approx(sum(parts), rel=0, abs=4e-16 * np.abs(parts).sum() * 4)
-    bridge = bridge_of(Contact(left))
-    assert (len(bridge.potentials), len(bridge.dampings)) == (3, 1)
 
 
 @given(st.floats(jkr_formulas.FOLD + 1e-6, 30.0))

@@ -172,16 +172,3 @@ def lowest_gap_on_the_way(row: tuple[int, float, float, float], r: float) -> flo
     gap = height(start + times) - platform(k, start + times, np)[0]
     inside = (gap[1:-1] < gap[:-2]) & (gap[1:-1] < gap[2:])
     return float(gap[1:-1][inside].min())
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"r": 0.9}, "`values` lacks epsilon"),
-        (LAW | {"delay_hertz": 0.2}, "`values` names 'delay_hertz': choose from r, epsilon, quality"),
-        (LAW | {"r": 1.2}, "`values`: r must lie between 0.01 and 1, but is 1.2"),
-    ],
-)
-def test_impossible_questions_are_errors(values, said):
-    with pytest.raises(ValueError, match=said):
-        amplitude_gradients(table_of(*ROWS), "law", values)

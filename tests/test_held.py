@@ -31,18 +31,6 @@ def test_a_constraint_on_what_is_held_holds_it_there_and_says_how_well():
     assert not {"structural_amplitude_n_per_m", "temperature_k", "viscosity_pa_s"} & {one.name for one in dry}
 
 
-@pytest.mark.parametrize(
-    ("fixed", "pair", "said"),
-    [
-        ({"tip_radius_nm": 20.0}, (30.0, 1.0), "tip_radius_nm is held at 20 .* and known as 30"),
-        ({}, (30.0, 0.0), "the constraint on tip_radius_nm must be a value and a positive error"),
-    ],
-)
-def test_contradictions_about_what_is_held_are_refused(fixed, pair, said):
-    with pytest.raises(ValueError, match=said):
-        split_held(OWN, fixed, {"tip_radius_nm": pair})
-
-
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_error_of_what_is_held_adds_to_that_of_what_does_the_same():

@@ -108,23 +108,6 @@ def test_a_nanosurf_spectrum_is_what_their_own_package_reads():
         read_curve(THERMAL)
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_nanosurf_force_curves_are_what_their_own_package_reads():
-    package = pytest.importorskip("NSFopen")
-    path = Path(package.__file__).parent / "example" / "Force_Spectroscopy" / "spectroscopy.nid"
-    if not path.exists():
-        pytest.skip("this release of NSFopen comes without its example")
-    theirs = pytest.importorskip("NSFopen.read").read(str(path)).data["Spec"]
-    segments = read_recording(path).segments
-    assert len(segments) == 200
-    for segment in (segments[0], segments[3], segments[-1]):
-        way = {"approach": "Forward", "retract": "Backward"}[segment.branch]
-        for name in ("Z-Axis Sensor", "Deflection"):
-            np.testing.assert_allclose(segment.channels[name], theirs[way][name][segment.curve - 1], rtol=1e-12)
-    curve = read_curve(path, curve=2)
-    assert (curve.deflection_unit, curve.amplitude) == ("nN", None)
-
-
 # ---- formats of which no real file is at hand
 
 
@@ -550,18 +533,6 @@ def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
     assert curve.slope is not None
     assert curve.slope[0] == pytest.approx(-1.0, rel=1e-12)
     assert 0.0 < curve.slope[1] < 1e-8
-
-
-def test_tapping_takes_a_raw_file_in_one_step(tmp_path: Path):
-    path = saved(tmp_path, raw_curve(500).text)
-    known = ["--spring-constant", "44 +- 4", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.60 +- 0.01"]
-    call = ["tapping", str(path), *known, "--drive", "force", "--columns", EIGHT, "--no-law", "--json"]
-    missing = CliRunner().invoke(main, call)
-    assert (missing.exit_code, missing.stdout) == (2, "")
-    assert "--nm-per-volt NM_PER_V|slope" in missing.stderr
-    told = strictly(CliRunner().invoke(main, [*call, "--nm-per-volt", "42", "--bin-nm", "0.5"]).stdout)
-    # 87 bins of half a nm each way over 43 nm
-    assert 170 <= len(told["rows"]) <= 176
 
 
 def test_the_example_gives_the_scale_and_the_energies_that_it_was_made_with():

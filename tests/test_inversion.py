@@ -161,16 +161,6 @@ def test_calibration_of_the_instrument_is_taken_back(exact):
     assert {*found.shared_names} == {"quality_factor", *known}
 
 
-def test_a_contradictory_row_is_named_and_an_error_of_the_frequency_is_systematic():
-    table = noisy(2, 0.1)
-    peak = np.array(table.peak_amplitude_nm)
-    peak[5] *= 1.1
-    found = invert(dataclasses.replace(table, peak_amplitude_nm=peak, free_frequency_error_khz=0.02))
-    assert found.shared_names == ("free_frequency_khz",)
-    assert np.all(found.shared[:, 2, 0] != 0.0)
-    assert "contradict each other" in found.note[5]
-
-
 def test_rows_that_give_nothing_are_named():
     table, _ = law_table(ImpactLaw(0.95, 60.0), 40.0, LAW_ROWS)
     amplitude, phase = np.array(table.peak_amplitude_nm), np.array(table.phase_deg)

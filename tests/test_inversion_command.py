@@ -48,10 +48,3 @@ def test_two_rows_end_with_exit_code_3(tmp_path: Path):
     assert "2 rows do not determine a line" in result.stderr
     assert strictly(result.stdout)["lines"] == {}
     assert "NOT VALID" in run(tmp_path / "table.csv").stdout
-
-
-def test_a_table_without_phases_is_refused(tmp_path: Path):
-    write_table(rows(TABLE, slice(0, 9), phase_deg=None, phase_error_deg=None), tmp_path / "table.csv")
-    result = run(tmp_path / "table.csv")
-    assert result.exit_code == 2
-    assert "no row has a phase with an amplitude" in " ".join(result.stderr.split())

@@ -12,7 +12,6 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
 from afm_jax.impact.map import next_impact
-from afm_jax.solve.derivatives import implicit_root
 from tests import reference_map
 from tests.package_scenes import scene_of
 from tests.reference_examples import SCENES
@@ -68,30 +67,3 @@ def test_equation_7_without_adhesion_is_that_of_equation_1(r, phase, velocity):
     turn = -(1.0 + r) * 2.0 * float(platform.angular_frequency) ** 2 * np.cos(phase)
     # V' = -r V + (1 + r) v_p: a few roundings.
     np.testing.assert_allclose(matrix, [[1.0, 0.0], [turn, -r]], rtol=1e-13, atol=1e-14)
-
-
-def _cubic(x, p):
-    return x**3 + p * x - 1.0
-
-
-def test_implicit_root_differentiates_twice_in_both_modes():
-    p = 0.5
-
-    def root(value):
-        found = jax.lax.stop_gradient(jnp.real(jnp.roots(jnp.array([1.0, 0.0, p, -1.0]), strip_zeros=False)))
-        x = found[jnp.argmin(jnp.abs(found**3 + p * found - 1.0))]
-        return implicit_root(_cubic, x, value)
-
-    with mpmath.workdps(40):
-        exact = [
-            mpmath.diff(lambda q: mpmath.findroot(lambda x: x**3 + q * x - 1, 0.6), mpmath.mpf(p), n) for n in (1, 2)
-        ]
-    for first in (jax.jacfwd(root), jax.jacrev(root)):
-        # The root is found by an eigenvalue solver, to about 1e-14.
-        assert float(first(p)) == pytest.approx(float(exact[0]), rel=1e-12)
-        assert float(jax.jacfwd(first)(p)) == pytest.approx(float(exact[1]), rel=1e-11)
-
-
-def test_implicit_root_at_a_fold_has_zero_derivative():
-    # x^2 = p at p = 0: no derivative exists; the rule says 0 and leaves the flag to the caller.
-    assert float(jax.grad(lambda p: implicit_root(lambda x, q: x**2 - q, jnp.zeros(()), p))(0.0)) == 0.0

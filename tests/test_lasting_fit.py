@@ -1,20 +1,16 @@
 """Fits of impacts that last: tables of the full contact, made by this program and by another one."""
 
-import re
-
 import numpy as np
 import pytest
 
-import afm_jax as afm
 from fitting import fit, read_table
-from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
+from fitting.examples.make_contact_amplitudes import EXAMPLE
 from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
 from fitting.infer.rows import plain_weights, weights_of
 from fitting.infer.search import Followed, orbits_at
 from fitting.infer.unknowns import Model
 from fitting.models import task_of
-from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
 from tests.fit_tables import holds
@@ -60,15 +56,6 @@ def at(model: Model, values: dict[str, float]) -> np.ndarray:
     return theta
 
 
-def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
-    model = model_for(shared, "viscous+delay")
-    values = {"epsilon": 1e-12, "viscous_loss": 0.0, "delay_hertz": 0.2, "delay_lead_nm": 6.0, "delay_offset_nm": 0.5}
-    theta = at(model, values)
-    weights = weights_of(model, theta, orbits_at(model, theta).orbits, np.zeros(shared.rows, bool))
-    assert np.all(np.isfinite(weights.model_error))
-    assert np.all(np.isfinite(weights.whitening))
-
-
 @pytest.mark.long
 def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
     for table in (shared, read_table(EXAMPLE)):
@@ -96,20 +83,6 @@ def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
     delay = paper_collisions(speeds[inside])[1]
     # the law of the delay fits to 1 ns
     np.testing.assert_allclose(viscous.law.collision_delay_us[inside], delay, rtol=0, atol=2e-3)
-
-
-def test_rows_set_aside_are_named(viscous, shared):
-    aside = np.flatnonzero(viscous.rows.set_aside)
-    assert aside.size >= 1
-    (said,) = [warning for warning in viscous.warnings if warning.startswith("Excluded")]
-    assert all(str(int(line)) in said for line in shared.lines[aside])
-    assert not np.any(viscous.rows.used & viscous.rows.set_aside)
-    assert np.isnan(viscous.rows.residual[aside]).all()
-    slowest = np.nanmin(viscous.rows.approach_speed_nm_per_us[viscous.rows.used])
-    assert np.nanmax(viscous.rows.approach_speed_nm_per_us[aside]) < 3.0 * slowest
-    used = np.isfinite(viscous.rows.residual).sum()
-    given = sum(parameter.constraint is not None for parameter in viscous.parameters.values())
-    assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
 
 
 def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient():
@@ -147,19 +120,3 @@ def test_the_contact_is_read_off_the_shared_table(shared):
 def test_without_noise_the_law_is_sharp():
     result = fit(paper_experiment().exact, model="contact")
     assert law_error(result) < 0.0012
-
-
-@pytest.mark.long
-def test_another_contact_without_noise():
-    made = simulate_experiment(afm.Contact.paper(relative_humidity=0.35), afm.Cantilever(90.0, 150.0), example_drives())
-    result = fit(made.exact, model="viscous+delay")
-    assert law_error(result, relative_humidity=0.35) < 0.0012
-
-
-def test_contact_parameters_that_do_the_same_are_said_to(shared):
-    """Humidity, temperature and molar volume act through the Kelvin length alone."""
-    free = ("relative_humidity", "temperature_k", "modulus_gpa")
-    result = fit(shared, model="contact", free=free)
-    said = " ".join([*result.reasons, *result.warnings])
-    assert "Not identified" in said or "Determined only together" in said or "is not identified" in said
-    assert {"relative_humidity", "temperature_k"} <= set(re.findall(r"\w+", said))

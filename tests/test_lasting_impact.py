@@ -27,7 +27,6 @@ from afm_jax.impact.lasting_impact import (
     depth_of_impact,
     hertz_under_pull,
     indentation,
-    middle_of_contact,
 )
 from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw, Speeds
 from tests.reference_hertz import DEEPEST, HERTZ_TIME, under_pull
@@ -195,22 +194,6 @@ def test_depth_and_loss_by_the_air_are_those_of_the_course_through_bridge_and_so
         assert lost == pytest.approx(4.0 * float(cantilever.decay_rate) * squared, rel=0.15 if ratio < 2.0 else 0.06)
 
 
-def test_middle_of_contact_is_the_platforms_motion_half_a_delay_earlier():
-    cantilever, platform = afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 183.0, 0.7)
-    leaving, delay, step = 1.234, 0.08, 1e-4
-    found = middle_of_contact(cantilever, platform, jnp.array(leaving - delay / 2.0))
-
-    def pull(t: float) -> float:
-        time = jnp.array(t)
-        spring = float(cantilever.angular_frequency) ** 2 * float(platform.position(time))
-        drag = 2.0 * float(cantilever.decay_rate) * float(platform.velocity(time))
-        return -spring - drag - float(platform.acceleration(time))
-
-    at = leaving - delay / 2.0
-    assert float(found.acceleration) == pytest.approx(pull(at), rel=1e-10)
-    assert float(found.change) == pytest.approx((pull(at + step) - pull(at - step)) / (2 * step), rel=1e-6)
-
-
 @pytest.mark.parametrize("pull", [-20.0, 15.0])
 def test_a_lead_is_covered_sooner_with_a_push(pull):
     u, w, lead = 40.0, 36.0, 5.0
@@ -224,18 +207,6 @@ def test_a_lead_is_covered_sooner_with_a_push(pull):
     way = BRIDGE_NM
     later = (time(w, pull) - way / w) - (time(u, pull) - way / u)
     assert delay == pytest.approx(-later * lead / (USUAL_LEAD * BRIDGE_NM), rel=1e-9)
-
-
-@pytest.mark.parametrize("numbers", [{}, {"relative_humidity": 0.7, "modulus_gpa": 30.0, "viscosity_pa_s": 3e-3}])
-def test_a_table_is_the_contacts_collisions(numbers):
-    contact = afm.Contact.paper(**numbers)
-    table = jax.jit(tabulated)(contact, jnp.array(1.0))
-    speeds = float(table.lowest) * np.geomspace(1.25, 20.0, 17)
-    truth = afm.collide(contact, speeds)
-    found = jax.vmap(table.speeds)(jnp.asarray(speeds))
-    assert not np.any(truth.captured)
-    np.testing.assert_allclose(found.rebound, truth.rebound_speed_nm_per_us, rtol=1e-7)
-    np.testing.assert_allclose(found.delay, truth.collision_delay_us, rtol=0, atol=1e-7)
 
 
 WET: dict[str, Any] = {"relative_humidity": 0.8, "adhesion_energy_j_per_m2": 0.15, "viscosity_pa_s": 1.005e-2}
@@ -288,31 +259,3 @@ def test_random_contacts_are_tabulated_from_capture_on():
 def test_a_table_begins_at_the_capture_speed(numbers):
     contact = afm.Contact.paper(**numbers)
     assert float(tabulated(contact, jnp.array(1.0)).lowest) == pytest.approx(float(capture_speed(contact)), rel=1e-9)
-
-
-def test_a_contact_too_extreme_for_its_table_is_known():
-    """Drag takes thirty times the capture energy: what the table says of itself is as bad as it is."""
-    contact = afm.Contact.paper(viscosity_pa_s=3.0)
-    table = tabulated(contact, jnp.array(0.2))
-    share, late = table.errors(2.0 * table.lowest)
-    assert float(share) > SPEED_ERROR or float(late) > DELAY_ERROR_US or float(table.lowest) > 1e5
-    assert np.isinf(float(tabulated(afm.Contact.paper(), jnp.array(1.0)).errors(jnp.array(5.0))[0]))
-
-
-@pytest.mark.slow
-def test_a_tables_derivatives_are_those_of_collisions():
-    """By viscosity, at speeds off the table's nodes: central differences of `collide`."""
-    speeds, usual = np.array([17.0, 33.0, 90.0]), 1.005e-3
-
-    def of_table(viscosity):
-        table = tabulated(afm.Contact.paper(viscosity_pa_s=viscosity), jnp.array(1.0))
-        found = jax.vmap(table.speeds)(jnp.asarray(speeds))
-        return found.rebound, found.delay
-
-    slopes = jax.jacfwd(of_table)(jnp.array(usual))
-    step = 1e-3 * usual
-    ahead, behind = (afm.collide(afm.Contact.paper(viscosity_pa_s=usual + h), speeds) for h in (step, -step))
-    for slope, name in zip(slopes, ("rebound_speed_nm_per_us", "collision_delay_us"), strict=True):
-        expected = (np.asarray(getattr(ahead, name)) - np.asarray(getattr(behind, name))) / (2.0 * step)
-        # collisions are right to 1e-9: over 2e-3 of the value that leaves 1e-6 of it, and the slope is 1e-2 of it
-        np.testing.assert_allclose(slope, expected, rtol=1e-3)

@@ -1,6 +1,5 @@
-"""Orbits of impacts that last: limits, a dense scan in NumPy, close pairs, and following from one to the next."""
+"""Orbits of impacts that last: limits, a dense scan in NumPy, close pairs."""
 
-import dataclasses
 import itertools
 
 import jax
@@ -9,9 +8,9 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots, follow_root, near_fold
+from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.orbits import contracts, orbit_state, steady_orbits, trace_and_determinant
+from afm_jax.impact.orbits import orbit_state, steady_orbits
 from tests.package_scenes import scene_of
 from tests.reference_examples import DELAY, scene
 from tests.reference_flight import Parameters
@@ -20,8 +19,6 @@ from tests.reference_lasting import closing_impacts, closing_speeds
 DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.03, 8.0, -0.5), (4, 3.9, 8.0, 1.0)]
 find = jax.jit(lambda problem: find_roots(problem, COARSE))
 steady = jax.jit(steady_orbits)
-follow = jax.jit(follow_root)
-WANTED = jnp.asarray(1.0) > 0.0
 
 
 def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> OrbitProblem:
@@ -99,53 +96,3 @@ def test_a_close_pair_is_found(order, reduced, amplitude):
     np.testing.assert_allclose(found, [first, second], rtol=1e-9)
     # without the second look at turning points nothing would be there
     assert len(found) == 2
-
-
-@pytest.mark.parametrize("drive", DRIVES[1:3])
-def test_following_leads_to_the_root_that_a_search_finds(drive):
-    p, order = delayed(*drive)
-    begin = steady(problem_of(p, order))
-    (slot,) = np.flatnonzero(begin.steady)
-    moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
-    root = follow(begin.place.coordinate[slot], moved, WANTED)
-    followed = root.place
-    assert bool(root.closes)
-    roots = find(moved)
-    coordinates = np.asarray(roots.place.coordinate)[np.asarray(roots.found)]
-    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed.coordinate)))]
-    assert float(followed.coordinate) == pytest.approx(nearest, rel=1e-10)
-    assert float(followed.coordinate) != pytest.approx(float(begin.place.coordinate[slot]), rel=1e-4)
-    assert not bool(root.near_fold)
-    # a tenth of a nanometre of drive: nothing leaves the sample
-    weak = problem_of(dataclasses.replace(p, amplitude_nm=0.1), order)
-    assert not bool(follow(begin.place.coordinate[slot], weak, WANTED).closes)
-
-
-def test_steady_orbits_and_folds_are_those_of_jacobian_and_closing_condition():
-    unstable = folds = 0
-
-    @jax.jit
-    def judged(place, problem: OrbitProblem):
-        flight = orbit_state(place, problem).flight
-        parts = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, flight)
-        return contracts(*parts), near_fold(place.coordinate, problem)
-
-    def driven(amplitude: float) -> OrbitProblem:
-        return problem_of(delayed(1, 0.97, amplitude, 0.0)[0], 1)
-
-    # from just above the fold, below which there is no orbit, up
-    nothing, weakest = 2.0, 2.17717
-    for _ in range(20):
-        middle = 0.5 * (nothing + weakest)
-        nothing, weakest = (nothing, middle) if bool(find(driven(middle)).found.any()) else (middle, weakest)
-    for amplitude in (weakest, weakest + 1e-6, 2.5, 8.0):
-        problem = driven(amplitude)
-        roots, steady_ones = find(problem), steady(problem)
-        for slot in np.flatnonzero(roots.found):
-            place = jax.tree.map(lambda leaf, slot=slot: leaf[slot], roots.place)
-            stable, fold = (bool(part) for part in judged(place, problem))
-            assert bool(roots.near_fold[slot]) == fold
-            assert stable or not bool(steady_ones.steady[slot])
-            unstable, folds = unstable + (not stable), folds + bool(roots.near_fold[slot])
-    assert unstable > 0
-    assert folds > 0

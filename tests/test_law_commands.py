@@ -1,7 +1,6 @@
 """From a law's file to what commands say of a scene: made of a contact, measured, named by a scene file or by --law."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -80,14 +79,3 @@ def test_a_measured_law_has_errors_and_an_end(folder):
     assert followed["law_parameters"] == [f"interaction.unknown_{number}" for number in range(1, 11)]
     # the unstable branch ends in capture, below the speeds that were measured
     assert followed["extrapolated"].startswith(known)
-
-
-@pytest.mark.slow
-def test_sweeps_say_where_the_law_is_extrapolated(folder, tmp_path):
-    fast, formula = tmp_path / "fast.csv", folder / "formula.toml"
-    fast.write_text("approach_speed_nm_per_us,rebound_speed_nm_per_us\n150,145\n200,194\n300,291\n400,388\n")
-    axis = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [3.0, 5.0, 3]\n'
-    (tmp_path / "sweep.toml").write_text(f'scene = "{formula}"\n[record]\nwhat = "orbits"\n{axis}')
-    swept = run("sweep", tmp_path / "sweep.toml", "--workers", 1, "--out", tmp_path / "out", "--law", fast)
-    said = r"Extrapolated: at [123] of 3 points impacts come outside the speeds that the law is known for\."
-    assert re.match(said, swept["extrapolated"])

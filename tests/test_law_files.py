@@ -9,14 +9,11 @@ import pytest
 
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
-from afm_jax.cli.scenes import as_drawn, with_fitted_law
 from afm_jax.scenefile.law_files import save_law_csv
-from afm_jax.scenefile.parameter_paths import scene_family
 from tests.test_scenefile import CANTILEVER, PLATFORM
 
 WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
 SPEEDS = np.geomspace(13.0, 300.0, 12)
-HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
 SCENE = CANTILEVER + "mass_ng = 1.5\n" + PLATFORM + "[interaction]\nmodel = 'law'\n"
 
 
@@ -79,20 +76,6 @@ def test_samples_have_the_errors_of_the_law(law):
         TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS)).sample(jax.random.key(1), 2)
 
 
-def test_measured_columns(tmp_path):
-    w, late = np.asarray(WET.rebound_speed(SPEEDS)), np.asarray(WET.collision_delay(SPEEDS))
-    rows = "\n".join("\t".join(map(repr, row)) for row in np.stack([SPEEDS, w, late], axis=1).tolist())
-    head = "# mass_ng = 1.2\n# origin = laser and lamp\n"
-    head += "approach_speed_nm_per_us\trebound_speed_nm_per_us\tcollision_delay_us\n"
-    (tmp_path / "law.csv").write_text(head + rows)
-    law = afm.load_law(tmp_path / "law.csv")
-    np.testing.assert_allclose(law.rebound_speed(SPEEDS), w, rtol=1e-12)
-    np.testing.assert_allclose(law.collision_delay(SPEEDS), late, rtol=1e-9)
-    assert law.mass_ng is not None
-    assert float(law.mass_ng) == 1.2
-    assert law.origin.text == "laser and lamp"
-
-
 def test_a_law_of_another_mass_and_a_batch_of_laws_are_refused(law, tmp_path):
     afm.save_law(law, tmp_path / "law.json")
     (tmp_path / "scene.toml").write_text(SCENE.replace("1.5", "2") + 'file = "law.json"\n')
@@ -105,14 +88,6 @@ def test_a_law_of_another_mass_and_a_batch_of_laws_are_refused(law, tmp_path):
         afm.save_scene(afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8), batch), tmp_path / "b.toml")
 
 
-def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(tmp_path):
-    instant = TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS), mass_ng=1.5)
-    told = instant.to_dict() | {"collision_delay_us": [0.0] * 12}
-    fit = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": told}
-    (tmp_path / "fit.json").write_text(json.dumps(fit))
-    assert eqx.tree_equal(afm.load_law(tmp_path / "fit.json"), instant)
-
-
 def test_the_table_of_collisions_is_a_law(tmp_path):
     """What `collide --out` writes, captured tips left empty."""
     head = "approach_speed_nm_per_us,rebound_speed_nm_per_us,collision_delay_us,captured,outcome,end_energy_aj"
@@ -122,16 +97,3 @@ def test_the_table_of_collisions_is_a_law(tmp_path):
     law = afm.load_law(tmp_path / "collide.csv")
     assert 8.0 <= float(law.capture_speed_nm_per_us) < 20.0
     assert float(law.rebound_speed(30.0)) == pytest.approx(28.0, rel=1e-12)
-
-
-def test_a_scene_and_one_with_a_drawn_law_run_in_the_same_programs(tmp_path):
-    """Their numbers have the same shapes: a law's errors would compile every program of a diagram a second time."""
-    head = "approach_speed_nm_per_us,rebound_speed_nm_per_us,rebound_speed_error_nm_per_us\n"
-    (tmp_path / "law.csv").write_text(head + "12,4.7,0.1\n20,16.7,0.1\n50,48.7,0.1\n200,199.6,0.1\n")
-    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(5.0, 190.0), afm.ImpactLaw(0.9))
-    made, known = with_fitted_law(scene, tmp_path / "law.csv")
-    assert known is not None
-    one = scene_family(made, *known.paths)(*np.zeros(len(known.paths)))
-    assert jax.tree.structure(as_drawn(made)) == jax.tree.structure(one)
-    assert jax.tree.map(jax.numpy.shape, as_drawn(made)) == jax.tree.map(jax.numpy.shape, one)
-    assert as_drawn(scene) is scene

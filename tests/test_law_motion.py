@@ -1,24 +1,17 @@
 """Law scenes in time: against the impact map, SciPy's integration, and the balance of energy."""
 
-import jax
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.junction import ContactPhase
-from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.map import iterate_map
 from afm_jax.motion.record import ContactKind, MotionOutcome
-from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from tests.law_systems import (
     PRESSING,
     PRESSING_DURATION,
     PRESSING_START,
-    ROWS,
     assert_same_rows,
     scene_of,
     simulated,
@@ -109,26 +102,6 @@ def test_the_ledger_of_energy_closes():
     assert gained == pytest.approx(change, abs=1e-5)
 
 
-def test_full_rows_end_a_simulation_where_another_can_begin():
-    scene = bouncing(delay=None)
-    start = (4.0, float(scene.platform.position(4.0)), 60.0)
-    whole = simulated(scene, start, 80.0)
-    part = simulated(scene, start, 80.0, 5)
-    assert int(whole.count) > 5
-    assert int(part.outcome) == MotionOutcome.CONTACT_LIMIT
-    assert int(part.count) == 5
-    assert float(part.final.time_us) == float(part.contacts.departure_time_us[4])
-    rest = simulate(scene, part.final, 84.0 - part.final.time_us, max_contacts=ROWS)
-    # the state is handed on to rounding; the map stretches by about 2 an impact
-    assert int(rest.count) == int(whole.count) - 5
-    assert float(rest.final.position_nm) == pytest.approx(float(whole.final.position_nm), rel=1e-10)
-    # as many rows as contacts are enough
-    between = 0.5 * float(whole.contacts.departure_time_us[4] + whole.contacts.arrival_time_us[5])
-    enough = simulated(scene, start, between - 4.0, 5)
-    assert int(enough.outcome) == MotionOutcome.FINISHED
-    assert int(enough.count) == 5
-
-
 def test_a_start_that_is_none_is_said():
     scene = bouncing(delay=None)
     # the last one is on the platform, into it; out of it, it is one
@@ -136,32 +109,3 @@ def test_a_start_that_is_none_is_said():
         result = simulated(scene, start, 0.5)
         assert (int(result.outcome), int(result.count)) == (MotionOutcome.INVALID_START, 0)
     assert int(simulated(scene, (0.0, 3.0, 1.0), 0.5).outcome) == MotionOutcome.FINISHED
-
-
-def test_an_end_within_the_collision_delay_is_on_the_platform():
-    scene = bouncing()
-    start = (4.0, float(scene.platform.position(4.0)), 60.0)
-    contacts = simulated(scene, start, 80.0).contacts
-    row = int(np.argmax(np.asarray(contacts.departure_time_us - contacts.arrival_time_us)))
-    middle = 0.5 * float(contacts.arrival_time_us[row] + contacts.departure_time_us[row])
-    cut = simulated(scene, start, middle - 4.0)
-    assert int(cut.count) == row + 1
-    assert int(cut.contacts.kind[row]) == ContactKind.HELD
-    assert int(cut.outcome) == MotionOutcome.HELD
-    assert float(cut.final.position_nm) == pytest.approx(float(scene.platform.position(cut.final.time_us)), abs=1e-12)
-
-
-def test_a_batch_is_its_members():
-    offsets, laws = np.array([4.0, -2.0, 0.5, 3.0]), np.array([0.3, 0.9, 0.5, 1.0])
-
-    def one(offset, r):
-        scene = Scene(Cantilever(90.0, 40.0), Platform(5.0, 20.0, offset), ImpactLaw(r))
-        return simulated(scene, PRESSING_START, 40.0)
-
-    batch = jax.vmap(one)(offsets, laws)
-    assert len(np.unique(batch.outcome)) > 1
-    for index in range(4):
-        alone = one(offsets[index], laws[index])
-        for ours, single in zip(jax.tree.leaves(batch), jax.tree.leaves(alone), strict=True):
-            # the same program, vectorised
-            np.testing.assert_allclose(np.asarray(ours)[index], np.asarray(single), rtol=1e-9, atol=1e-9)

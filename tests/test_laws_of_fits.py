@@ -115,13 +115,6 @@ def test_derivatives_of_formulas_are_those_of_differences(law):
     assert abs(law.at(theta, np.array([law.capture(theta)])).square[0]) < 1e-9
 
 
-def test_parameters_and_unknowns_are_each_others_inverse(law):
-    theta = unknowns(law, LASTING)
-    values = law.values(theta)
-    for name in law.own:
-        assert values[name] == pytest.approx(LASTING[name], rel=1e-12)
-
-
 @pytest.fixture(scope="module")
 def contact() -> ContactLawModel:
     held = (Held("tip_radius_nm", 10.0, 3.0, assumed=True),)

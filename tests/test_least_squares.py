@@ -62,18 +62,6 @@ def test_a_search_alone_ends_where_scipys_does(truth):
     np.testing.assert_allclose(end.place, scipy.x, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_a_search_that_is_lost_stays_where_it_began(number):
-    def spoilt(place):
-        found = at(TRUTHS[0])(place)
-        return Sum(number, np.full_like(found.residual, number), np.full_like(found.jacobian, number))
-
-    with np.errstate(invalid="ignore"):
-        end = levenberg_marquardt(spoilt, START, settled=1e-12, most=60)
-    assert np.isnan(end.distance)
-    np.testing.assert_array_equal(end.place, START)
-
-
 def test_covariances_are_inverses_where_there_are_some():
     random = np.random.default_rng(3)
     factor = random.normal(size=(5, 4, 3)) * [1e-8, 1.0, 1e6]

@@ -62,10 +62,3 @@ def test_another_order_ends_with_exit_code_3(tmp_path: Path, order: int, named: 
     assert named in result.stderr
     told = strictly(result.stdout)
     assert (told["valid"], told["reason"]) == (False, told["reasons"][0])
-
-
-def test_a_trace_without_its_drive_frequency_is_refused(tmp_path: Path):
-    path, _ = written(tmp_path / "bare.txt")
-    result = run(path)
-    assert result.exit_code == 2
-    assert f"{path}: the drive frequency is missing; give --drive-frequency-khz or" in " ".join(result.stderr.split())

@@ -39,16 +39,6 @@ def found():
 
 
 @pytest.mark.slow
-def test_the_picture_has_a_dot_a_motion_and_the_band(found):
-    band = np.column_stack([np.zeros(4), np.ones(4)])
-    (axes,) = found._replace(larger_interval95=band).plot().axes
-    smaller, larger = axes.lines[:2]
-    np.testing.assert_array_equal(np.asarray(larger.get_ydata()), found.exponents_per_impact[:, 0])
-    np.testing.assert_array_equal(np.asarray(smaller.get_ydata()), found.exponents_per_impact[:, 1])
-    assert np.ptp(axes.collections[0].get_paths()[0].vertices[:, 1]) == 1.0
-
-
-@pytest.mark.slow
 def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers(found):
     assert found.verdicts.names()[:3] == ["(1,1)"] * 3
     for lane, reduced in enumerate(REGULAR):
@@ -102,33 +92,6 @@ def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
 
 
 @pytest.mark.slow
-def test_a_motion_that_stays_on_an_unstable_orbit_is_undecided():
-    """A lever of 159 kHz over a resting sample, driven by a force: its (1,1) orbit has the multipliers -2.24, -0.26."""
-    drive = np.linspace(437.0, 437.3, 80)
-    lever, law = afm.Cantilever(159.155, 25.0), afm.ImpactLaw(0.8)
-    scene = afm.Scene(lever, afm.Platform(0.0, 437.676), law, force=afm.ForceDrive(1.0, 437.676))
-    scenes = scene_batch(scene, {"force.frequency_khz": drive})
-    orbits = jax.vmap(lambda each: afm.single_impact_orbits(each, 1))(scenes)
-    slot = np.argmax(np.asarray(orbits.admissible), axis=1)[:, None]
-    phase, velocity = (
-        np.take_along_axis(np.asarray(part), slot, axis=1)[:, 0]
-        for part in (orbits.phase_rad, orbits.velocity_after_nm_per_us)
-    )
-    # of starts on the orbit itself about every seventh comes back to the very same numbers
-    start = State(phase / (2e-3 * np.pi * drive), np.zeros_like(phase), velocity)
-    from_orbits = lyapunov_spectrum(scenes, start, **LONG)
-    stay = [name == "(1,1)" for name in from_orbits.verdicts.names()]
-    assert any(stay)
-    assert ["unstable" in words for words in exponent_verdicts(from_orbits)] == stay
-    found = lyapunov_spectrum(scene, impacts=2000, transient=500)
-    assert (found.verdicts.impacts, found.verdicts.periods) == (30, 24)
-    # 30 impacts in 24 periods: the determinant of the map is r^2 exp(-Omega T/Q)
-    damped = 2.0 * np.pi * 0.159155 / 25.0 * (24.0 / 30.0) / 0.437676
-    assert found.exponents_per_impact.sum() == pytest.approx(2.0 * np.log(0.8) - damped, abs=1e-9)
-    assert found.exponents_per_impact[0] == pytest.approx(-0.13126, abs=1e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.long
 def test_the_contact_is_chaotic_at_high_frequency():
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0 * 5.277), afm.Contact.paper())
@@ -166,9 +129,3 @@ def test_the_command_tells_null_where_there_is_no_exponent(tmp_path):
     assert told["exponents_per_us"] == told["exponents_per_impact"] == [None, None]
     assert "forgets" in told["verdict"]
     assert {"impacts", "exponents_per_us_error", "exponents_per_impact_error"} <= set(told)
-    # far above the platform the free motion dies away
-    away = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(1.0, 180.0, -30.0), afm.ImpactLaw(0.5))
-    afm.save_scene(away, file)
-    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", *OPTIONS])
-    assert run.exit_code == 3
-    assert "free: the tip no longer meets the platform" in json.loads(run.stdout)["reason"]

@@ -1,9 +1,7 @@
 """Pictures of motions: which there are for which scene, what they show, and numbers behind them."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
@@ -12,14 +10,12 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import Simulation
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
 from afm_jax.plots.motion import draw_motion, look_at, spectrum_figure, spectrum_of
-from afm_jax.scenefile import presets
 
 ALL = ["time_course.png", "spectrum.png", "poincare.png", "force_gap.png"]
 
@@ -34,27 +30,6 @@ def drawn(scene: Scene, found: Simulation, folder: Path) -> list[str]:
     return [path.name for path in files]
 
 
-@pytest.fixture(scope="module")
-def bouncing():
-    scene = presets.contact_scene(1.01, 4.0, 0.0)
-    return scene, simulate(scene, default_start(scene), 60.0)
-
-
-@pytest.mark.slow
-def test_the_stretch_shown_ends_with_whole_contacts(bouncing):
-    scene, found = bouncing
-    look = look_at(scene, found)
-    rows = int(found.count)
-    assert look.dense.contacts.arrival_time_us.size == rows
-    # six contacts, each with bridge and junction resolved
-    shown = look.dense.contacts.arrival_time_us[-6:]
-    assert look.from_us < shown[0] < look.to_us
-    for arrival, departure in zip(shown, look.dense.contacts.departure_time_us[-6:], strict=True):
-        part = look.between(arrival, departure)
-        assert {ContactPhase.BRIDGE, ContactPhase.JUNCTION} <= set(part.phase.tolist())
-        assert part.force_nn.min() < -50.0  # the pull-off force is over 100 nN
-
-
 def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):
     base = BaseDrive(0.5, 88.0, 0.0)
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0), None, base)
@@ -67,14 +42,6 @@ def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):
     response = 90.0**2 / (90.0**2 - 88.0**2 + 1j * 88.0 * 90.0 / 40.0) - 1.0
     # the transient has decayed by exp(-6000/141)
     assert amplitude_nm[line] == pytest.approx(0.5 * abs(response), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
-    scene, found = bouncing
-    for changes, said in (({"count": jnp.array([1, 2])}, "pick one of"), ({"final": found.start}, "nothing to draw")):
-        with pytest.raises(ValueError, match=said):
-            draw_motion(scene, replace(found, **changes), tmp_path)
 
 
 def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_the_orbit(tmp_path: Path):
@@ -93,18 +60,3 @@ def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_th
     assert amplitude_nm[line] == pytest.approx(float(orbits.lockin_amplitude_nm[slot]), rel=2e-3)
     (axes,) = spectrum_figure(look).axes
     assert "subharmonics, drive/2" in axes.get_legend_handles_labels()[1]
-
-
-@pytest.mark.slow
-def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(bouncing, tmp_path: Path):
-    scene = presets.contact_scene(1.01, 4.0, 0.0)
-    # 5 nm/us down onto a sample that has just turned: below the capture speed of 10.9 nm/us
-    found = simulate(scene, state(0.0, 9.0, -5.0), 60.0)
-    assert bool(found.held)
-    look = look_at(scene, found)
-    arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
-    assert arrival < look.to_us < arrival + 45.0
-    assert look.path.phase[-1] == ContactPhase.JUNCTION
-    # one that bounces has every picture
-    scene, found = bouncing
-    assert drawn(scene, found, tmp_path) == ALL

@@ -55,19 +55,6 @@ def test_only_public_names(path):
     assert names_that_are_not_public(code_of(path)) == []
 
 
-def test_names_of_rooms_are_found():
-    source = (
-        "import afm_jax as afm, afm_jax.impact.map\nfrom fitting.infer import fit\nfrom afm_jax import solve\n"
-        "afm.motion"
-    )
-    assert names_that_are_not_public(source) == [
-        "afm_jax.impact.map",
-        "fitting.infer.fit",
-        "afm_jax.solve",
-        "afm_jax.motion",
-    ]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_stored_without_outputs_and_ending_with_an_assertion(path):
     import nbformat  # noqa: PLC0415  # a second and a half, which listing the tests need not take

@@ -1,25 +1,18 @@
 """Settling and observables, compared with closed forms, with orbits of the impact law, and with made-up sequences."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, single_impact_orbits
-from afm_jax.apparatus.drives import BaseDrive, Tone
-from afm_jax.apparatus.scene import drive_of
-from afm_jax.apparatus.surface import surface_of
-from afm_jax.impact.orbits import FlightEnds, highest_of_flight
+from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.observe import (
-    OBSERVABLES,
     MotionWindow,
     Observables,
     observe,
     poincare_section,
 )
-from afm_jax.motion.periodic import close_periods
-from afm_jax.motion.record import State, with_response
-from afm_jax.motion.settle import find_repetitions, last_fifth, settled
+from afm_jax.motion.settle import find_repetitions
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.motion.trajectory import DensePath
@@ -82,45 +75,6 @@ def test_a_slow_approach_has_not_arrived():
     np.testing.assert_allclose(remaining, exact, rtol=0.01)
 
 
-def test_chaos_does_not_repeat():
-    x = [0.3]
-    for _ in range(2000):
-        x.append(3.9 * x[-1] * (1.0 - x[-1]))
-    times = 2.0 * np.arange(len(x)) + 0.3 * np.array(x)
-    assert repetition(times, 40.0 + np.array(x), tolerance=1e-4)[0] == 0
-
-
-def test_the_last_fifth_has_whole_periods():
-    drive = drive_of(law_scene())
-    for periods, whole in ((400.0, 80), (60.0, 12), (3.0, 1)):
-        window = last_fifth(0.0, periods * drive.period_us, drive)
-        assert window.responses == whole
-        np.testing.assert_allclose(window.from_us, (periods - whole) * drive.period_us, rtol=1e-12)
-    assert last_fifth(0.0, 2.0, drive) == (1.6, 2.0, 1, 0)
-
-
-def test_newton_closes_a_map_and_knows_its_contraction():
-    slopes = np.array([[0.3, -0.2], [0.4, 0.5]])
-    fixed = np.array([[3.0], [40.0]])
-
-    def ends(starts: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        moved = slopes @ (starts[1:] - fixed) + fixed
-        moved[0] += 1e-3 * (starts[1] - fixed[0]) ** 2
-        # the second one has no end; the third one stands still wherever it is: I - M is singular
-        return np.where(rows == 1, np.nan, np.where(rows == 2, starts[1:], moved))
-
-    starts = np.array([[0.7] * 4, [3.2, 3.2, 3.2, 9.0], [41.0, 41.0, 41.0, 41.0]])
-    found = close_periods(ends, starts, np.array([0, 1, 2, 3]), angular_frequency=0.5, reach=0.05)
-    # the fourth has to go too far
-    assert not found.closed[[1, 3]].any()
-    assert found.closed[0]
-    assert not found.contraction[1] < np.inf
-    assert not found.closed[2] or found.contraction[2] == pytest.approx(1.0, rel=1e-9)
-    np.testing.assert_allclose(found.starts[:, 0], [0.7, 3.0, 40.0], rtol=1e-9)
-    # central differences of a quadratic are exact but for rounding, 1e-16 over 1e-5
-    np.testing.assert_allclose(found.contraction[0], np.sqrt(np.linalg.det(slopes)), rtol=1e-9)
-
-
 def test_a_law_settles_on_its_orbit():
     scene = law_scene()
     orbits = single_impact_orbits(scene, 1)
@@ -139,13 +93,6 @@ def test_a_law_settles_on_its_orbit():
     speed = float(orbits.approach_speed_nm_per_us[slot])
     last = [phases[-1], rows.approach_speed_nm_per_us[-1]]
     np.testing.assert_allclose(last, [np.degrees(phase), speed], rtol=1e-7)
-
-
-def test_the_table_of_observables_is_complete():
-    assert Observables._fields[-len(OBSERVABLES) :] == tuple(OBSERVABLES)
-    # what may be None says why
-    kinds = Observables.__annotations__
-    assert all(("None" in str(kinds[name])) == bool(observable.absent) for name, observable in OBSERVABLES.items())
 
 
 def test_the_platform_gives_what_air_and_impacts_take():
@@ -209,25 +156,6 @@ def test_a_vibration_that_dies_away_settles_when_it_has():
     assert follow_long(scene, state(0.0, 50.0, 0.0), 2500.0).verdict.settled
 
 
-@pytest.mark.slow
-def test_nothing_settles_under_a_ramp_or_two_frequencies():
-    ramped = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, 0.0, 1e-3), TABULATED)
-    beating = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, second=Tone(0.1, 33.0)), TABULATED)
-    for scene, why in ((ramped, "ramps"), (beating, "several frequencies")):
-        run, _ = seen_of(scene, 60.0)
-        assert (run.verdict.settled, run.verdict.periods) == (False, None)
-        assert why in run.verdict.reason
-
-
-def test_pieces_are_the_whole():
-    scene = law_scene(ImpactLaw(0.9, 20.0))
-    whole = follow_long(scene, default_start(scene), 400.5 * float(scene.platform.period_us))
-    assert whole.pieces > 1
-    times = np.asarray(whole.simulation.contacts.arrival_time_us)
-    assert np.all(np.diff(times) > 0.5 * float(scene.platform.period_us))
-    assert len(times) == int(whole.simulation.count) == 400
-
-
 def test_a_start_has_the_phase_it_was_told():
     scene = law_scene()
     begin = start_of(scene, (450.0, 5.0, 80.0))
@@ -240,15 +168,6 @@ def test_a_start_has_the_phase_it_was_told():
     np.testing.assert_allclose(many.time_us, 250.0 / frequencies, rtol=1e-14)
     np.testing.assert_allclose(many.position_nm, 5.0 + offsets, rtol=1e-12)
     np.testing.assert_array_equal(many.velocity_nm_per_us, [80.0] * 3)
-
-
-def test_bad_arguments_are_told():
-    scene = law_scene()
-    simulation = follow_long(scene, default_start(scene), 20.0).simulation
-    with pytest.raises(ValueError, match="`harmonics` must be positive integers, but are"):
-        observe(scene, simulation, harmonics=(0,))
-    with pytest.raises(ValueError, match="`tolerance` must be positive, but is 0"):
-        settled(scene, simulation, tolerance=0.0)
 
 
 @pytest.mark.slow
@@ -265,32 +184,3 @@ def test_the_contact_reaches_the_heights_of_the_paper(reduced: float, amplitude:
     assert seen.most_attractive_force_nn is not None
     # the JKR contact pulls with 3/2 pi w R at most: 141.37 nN for w = 0.3 J/m^2, R = 100 nm
     np.testing.assert_allclose(seen.most_attractive_force_nn, -1.5 * np.pi * 0.3 * 100.0, rtol=1e-5)
-
-
-def test_velocities_that_alternate_within_rounding_are_one():
-    turns, sign = np.arange(1.0, 61.0)[None], np.array([1.0, -1.0] * 30)
-    for size, rounding, contacts in ((3e-7, 1e-6, 1), (3e-7, 1e-8, 2), (3e-4, 1e-6, 2)):
-        found = find_repetitions(turns, 40.0 * (1.0 + size * sign)[None], tolerance=1e-4, rounding=rounding)
-        assert (found.contacts[0], found.periods[0]) == (contacts, contacts)
-
-
-def peak_of_flight(scene: Scene, start: State, lasts_us: float) -> float:
-    cantilever, response, lasts = scene.cantilever, surface_of(scene)[1], jnp.asarray(lasts_us)
-    _, position, velocity = with_response(response, start, -1.0)
-    ends = cantilever.propagator(lasts)(position, velocity)
-    return float(highest_of_flight(cantilever, FlightEnds(start.time_us, lasts, position, velocity, *ends), response))
-
-
-def test_highest_points_are_those_of_the_closed_form():
-    # undamped, from rest position upward: a quarter period later at v/Omega
-    scene = Scene(Cantilever(90.0), Platform(1.0, 180.0, -50.0), ImpactLaw(0.5))
-    omega = float(scene.cantilever.angular_frequency)
-    peaks = [peak_of_flight(scene, state(1.0, 0.0, v), lasts) for v, lasts in ((30.0, 2.0), (30.0, 5.0), (-30.0, 5.0))]
-    ends = [30.0 / omega * np.sin(omega * 2.0), 30.0 / omega, 0.0]
-    # a last grid of quarter/256^3: rounding
-    np.testing.assert_allclose(peaks, ends, rtol=1e-13, atol=1e-13)
-    # moved with its base by a steady response: far below resonance that is the base's own motion
-    driven = Scene(scene.cantilever, scene.platform, scene.interaction, base=BaseDrive(2.0, 1.0))
-    still = peak_of_flight(driven, state(0.0, 2.0, 0.0), 1000.0)
-    # the response to 1 kHz is larger by (1/90)^2, and leaves a free vibration that small
-    assert still == pytest.approx(2.0, rel=5e-4)

@@ -125,11 +125,6 @@ def test_resonance_is_closed_form(quality_factor):
     assert float(orbits.lockin_phase_deg[best]) == pytest.approx(270.0, abs=1e-7)
 
 
-def test_without_drive_there_is_no_orbit():
-    orbits = single_impact_orbits(bouncing(amplitude_nm=0.0, delay=None), 1)
-    assert not np.any(orbits.exists)
-
-
 @pytest.mark.parametrize("order", [0, 1.5, float("nan"), np.array([1, 2])])
 def test_orders_that_are_none_are_refused(order):
     with pytest.raises(ValueError, match=r"^`order` must be a positive integer, but is "):

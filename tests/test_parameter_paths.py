@@ -1,7 +1,6 @@
-"""Parameters by their paths in a scene file: what ranges may be, and what scenes become."""
+"""Parameters by their paths in a scene file: what scenes become."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,9 +11,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.scenefile.parameter_paths import (
-    check_ranges,
     parameter_values,
-    parse_range,
     scene_batch,
     scene_family,
 )
@@ -24,22 +21,6 @@ from afm_jax.scenefile.scenefile import load_scene, save_scene
 def law_scene(**parts) -> Scene:
     law = ImpactLaw(0.9, 20.0, 0.3, CollisionDelay(0.2, 5.0, 0.7))
     return Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0, 0.5, second=Tone(1.0, 33.0)), law, **parts)
-
-
-def test_what_is_no_range_is_said():
-    """What else a range cannot be, and what a scene cannot have, are lines of the corpus (`tests.malformed`)."""
-    for text, counted, words in (
-        ("platform.amplitude_nm=1:2", True, "no rising range of a parameter"),
-        ("=1:2:3", True, "no rising range of a parameter"),
-        ("platform.amplitude_nm=1:2:1", True, "the number of values"),
-        ("interaction.r=0.5:0.9:3", False, "PARAMETER=low:high as in"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            parse_range(text, counted=counted)
-    ranges = [parse_range(f"platform.{name}=1:2", counted=False) for name in ("reduced_frequency", "frequency_khz")]
-    assert ranges[0][:3] == ("platform.reduced_frequency", 1.0, 2.0)
-    with pytest.raises(ValueError, match="change the same parameter"):
-        check_ranges(law_scene(), *ranges)
 
 
 @pytest.mark.parametrize(
@@ -83,14 +64,3 @@ def test_a_batch_is_the_scenes_one_by_one():
     # the cantilever comes before reduced frequencies
     made = scene_family(law_scene(), "platform.reduced_frequency", "cantilever.frequency_khz")(1.5, 100.0)
     assert float(made.platform.frequency_khz) == pytest.approx(300.0, rel=1e-15)
-
-
-def test_scenes_are_differentiable_by_any_path():
-    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0), Contact.paper())
-    at = scene_family(scene, "platform.reduced_frequency", "interaction.modulus_gpa")
-
-    def numbers(n, k):
-        made = at(n, k)
-        return jnp.stack([made.platform.frequency_khz, made.interaction.junction.modulus_gpa])
-
-    np.testing.assert_allclose(jax.jacfwd(numbers, (0, 1))(1.0, 100.0), [[180.0, 0.0], [0.0, 1.0]])

@@ -20,20 +20,6 @@ def found_in(coefficients, low=LOW, high=HIGH) -> np.ndarray:
     return np.asarray(roots)[np.asarray(exists)]
 
 
-@settings(deadline=None, max_examples=80)
-@given(
-    roots=st.lists(st.integers(-60, 200), min_size=4, max_size=4, unique=True), scale=st.sampled_from([-3.0, 1e-6, 1e5])
-)
-def test_separate_roots_are_all_found(roots, scale):
-    exact = np.sort(np.array(roots)) / 16.0 + 1 / 64  # not on an end of the interval; exact in binary
-    coefficients = scale * np.poly(exact)
-    inside = exact[(exact > LOW) & (exact < HIGH)]
-    found = found_in(coefficients)
-    assert found.shape == inside.shape
-    # Roots 1/16 apart: the condition of the closest four is below 1e6 roundings of numbers up to 10.
-    np.testing.assert_allclose(found, inside, rtol=0, atol=1e-8)
-
-
 @pytest.mark.filterwarnings("ignore:Descending")  # newer mpmath would like the lowest power first, older cannot
 @settings(deadline=None, max_examples=80)
 @given(coefficients=st.lists(st.integers(-50, 50), min_size=5, max_size=5))

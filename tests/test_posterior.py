@@ -1,13 +1,11 @@
-"""The posterior against quadrature of another program's amplitudes and importance sampling."""
+"""The posterior against another program's amplitudes and importance sampling."""
 
 import dataclasses
-import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import ImpactLaw
@@ -18,25 +16,14 @@ from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chai
 from tests.fit_tables import _orbits as orbits_of
 from tests.fit_tables import (
     amplitudes_and_errors,
-    example_amplitudes,
     fit_of_every_fourth,
-    rows,
-    simulated,
     standard_errors_of,
     values_of,
 )
-from tests.fit_tables import steady_amplitudes as amplitudes_of
 from tests.impact_tables import drives
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
-
-
-@pytest.fixture(scope="module")
-def exact_q():
-    """A table of a law without adhesion, its quality factor exactly known."""
-    every_fourth = rows(example_amplitudes(), slice(0, None, 4), quality_factor=40.0, quality_factor_error=None)
-    return simulated(every_fourth, ImpactLaw(0.95, 0.0), seed=8)
 
 
 @pytest.fixture(scope="module")
@@ -56,31 +43,6 @@ def assert_close(found, name: str, mean: float, deviation: float) -> None:
     assert count > 400
     assert found.mean[name] == pytest.approx(mean, abs=4.0 * deviation / np.sqrt(count))
     assert found.standard_deviation[name] == pytest.approx(deviation, rel=4.0 / np.sqrt(2.0 * count))
-
-
-@pytest.mark.long
-def test_one_parameter_agrees_with_quadrature(exact_q):
-    result = fit(exact_q, "restitution")
-    found = posterior(result)
-    amplitude, error = amplitudes_and_errors(exact_q)
-
-    def density(r):
-        predicted = amplitudes_of(exact_q, ImpactLaw(r, 0.0))
-        return np.exp(-0.5 * (np.sum(((predicted - amplitude) / error) ** 2) - result.chi2))
-
-    sigma = result.parameters["r"].standard_error
-    assert sigma is not None
-    middle = result.parameters["r"].value
-    ends = middle - 7.0 * sigma, middle + 7.0 * sigma
-    total = quad(density, *ends, epsrel=1e-8)[0]
-    mean = quad(lambda r: r * density(r), *ends, epsrel=1e-8)[0] / total
-    variance = quad(lambda r: (r - mean) ** 2 * density(r), *ends, epsrel=1e-8)[0] / total
-    assert_close(found, "r", mean, np.sqrt(variance))
-    count = found.chains.effective_samples[0]
-    for end, share in zip(found.interval95["r"], (0.025, 0.975), strict=True):
-        # four binomial deviations of the share below
-        deviation = np.sqrt(0.025 * 0.975 / count)
-        assert quad(density, ends[0], end, epsrel=1e-8)[0] / total == pytest.approx(share, abs=4.0 * deviation)
 
 
 def test_the_sampler_agrees_with_importance_sampling(law, sampled):
@@ -139,19 +101,6 @@ def test_the_samplers_density_is_that_of_another_programs_amplitudes(law, log_de
     assert float(log_density(here) - log_density(there)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_prior_is_the_derivative_of_the_values(log_density):
-    z, step = jnp.array([0.3, -0.4, 0.2]), 1e-5
-
-    def values(shift):
-        of_law, instrument, _ = log_density.place(z + shift)
-        return np.array([*of_law.values(), *instrument])
-
-    jacobian = np.array([values(shift) - values(-shift) for shift in step * np.eye(3)]) / (2.0 * step)
-    # up to the constant determinant of axes and errors; central differences to 1e-10
-    constant = np.linalg.slogdet(log_density.axes)[1] + np.sum(np.log(log_density.errors))
-    assert np.linalg.slogdet(jacobian)[1] - constant == pytest.approx(float(log_density.place(z)[2]), abs=1e-6)
-
-
 @pytest.fixture(scope="module")
 def of_lasting():
     """A fit of impacts that last, and its posterior."""
@@ -180,12 +129,6 @@ def test_samples_are_given_to_arviz(of_lasting):
     np.testing.assert_array_equal(given["epsilon"], found.chains.samples[:, :, list(found.mean).index("epsilon")])
 
 
-def test_without_arviz_it_says_what_to_do(of_lasting, monkeypatch):
-    monkeypatch.setitem(sys.modules, "arviz", None)
-    with pytest.raises(ImportError, match="pip install arviz"):
-        of_lasting[1].to_arviz()
-
-
 def test_chains_that_disagree_are_not_believed():
     random = np.random.default_rng(1)
     samples = random.normal(size=(4, 100, 1))
@@ -196,9 +139,3 @@ def test_chains_that_disagree_are_not_believed():
         found = posterior_of_chains(dataclasses.replace(fine, **changes), ("r",), "nuts")
         assert not found.converged
         assert len(found.reasons) == 1
-
-
-def test_wrong_calls_are_refused_in_one_line(law, monkeypatch):
-    monkeypatch.setitem(sys.modules, "blackjax", None)
-    with pytest.raises(ImportError, match=r"pip install 'afm-jax\[nuts\]'"):
-        posterior(law)

@@ -109,7 +109,7 @@ FEWER = (
 PAGES_WITH_COMMANDS = ("first_steps", "simulate", "drives", "contact", "fit", "orbits")
 PAGES_WITH_COMMANDS += ("dynamics", "instrument", "design", "tapping", "sweeps")
 LEFT_OUT = {
-    "simulate figure8": "tests/test_sweep.py simulates it",
+    "simulate figure8": "tests/test_simulate_contact.py simulates such scenes",
     "calibrate fitting/examples/real": "tests/test_thermal.py fits such spectra",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
     "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",

@@ -1,14 +1,12 @@
-"""Reading resonance sweeps: both forms, and every fault as one line that says what, where and how to mend it."""
+"""Reading resonance sweeps in both forms."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from fitting import read_resonance
 from fitting.calibration.sweep import Resonance
-from fitting.tables.csv_text import TableError
 
 ROWS = ("89.5,1.25,60", "90,2.5,-3.5e1", "90.5,1.125,-120")
 NANONIS = (
@@ -49,25 +47,3 @@ def test_nanonis_text_comes_back(tmp_path):
     assert sweep.amplitude == pytest.approx([0.520545, 0.459461], rel=1e-14)
     np.testing.assert_array_equal(sweep.phase_deg, [90.306, -39.635])
     assert sweep.instrument == {"frequency_khz": pytest.approx(30.2815, rel=1e-14), "quality_factor": 1161.0}
-
-
-def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
-    text = "[DATA]\nFrequency (Hz)\tAmplitude (m)\n30000\t1e-9\n30001\t2e-9\n"
-    sweep = read(tmp_path, text)
-    assert sweep.frequency_khz.tolist() == [30.0, 30.001]
-    assert (sweep.phase_deg, sweep.instrument) == (None, {})
-    with pytest.raises(
-        TableError,
-        match=r"amplitude in m over the frequency \(or its shift and the center frequency\), but Frequency Shift",
-    ):
-        read(tmp_path, text.replace("Frequency (Hz)", "Frequency Shift (Hz)"))
-
-
-def test_faults_of_sweeps_in_memory():
-    one, none = np.array([1.0, 2.0]), np.zeros(0)
-    cases: Any = (
-        ({"frequency_khz": none, "amplitude": none}, r"sweep in memory, column frequency_khz: has the shape \(0,\)"),
-    )
-    for columns, said in cases:
-        with pytest.raises(TableError, match=said):
-            Resonance(**({"frequency_khz": one, "amplitude": one} | columns))

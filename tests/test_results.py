@@ -3,15 +3,11 @@
 import collections.abc
 import dataclasses
 import enum
-import importlib
 import inspect
 import json
 import math
-import subprocess
-import sys
 import types
 import typing
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +19,9 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax import results, saved
-from afm_jax.contact.collide import Collisions
-from afm_jax.dynamics.bifurcations import Ramps
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.studies.effects import EffectStudy
 from fitting.infer.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
 from tests.fresh_python import python
@@ -248,29 +241,6 @@ def test_every_result_of_numbers_is_a_table_and_a_picture_that_says_what_is_draw
         assert "<svg" in (tmp_path / "picture.svg").read_text(), name
 
 
-USER = """
-from typing import assert_type
-import afm_jax as afm, fitting, jax, pandas as pd
-
-assert_type(fitting.fit("amplitudes.csv").parameters["r"].value, float)
-collision = afm.collide(afm.Contact.paper(), 1.0)
-assert_type(collision.to_pandas(), pd.DataFrame)
-assert_type(collision.rebound_speed_nm_per_us, jax.Array)
-collision.rebound_speed  # pyright: ignore[reportAttributeAccessIssue]
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not find_spec("pyright"), reason="no pyright")
-def test_type_checkers_of_users_see_the_methods_of_results(tmp_path: Path):
-    (tmp_path / "user.py").write_text(USER)
-    settings = {"extraPaths": [str(ROOT)], "reportUnnecessaryTypeIgnoreComment": True}
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
-    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "user.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-
-
 @pytest.mark.slow
 def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0), afm.ImpactLaw(0.95, 60.0))
@@ -320,13 +290,6 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
     np.testing.assert_array_equal(drawn["contact"], [[5.0, np.nan], [20.0, 3.0], [40.0, 1.0]])
     for axes in (middle, lower):
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
-
-
-@pytest.mark.parametrize("told", [Ramps, Collisions, EffectStudy])
-def test_what_a_command_tells_names_a_picture_that_there_is(told: type):
-    module, _, name = getattr(told, "_picture").partition(":")  # noqa: B009  # no field of a named tuple
-    assert callable(getattr(importlib.import_module(module), name))
-    assert getattr(told, "plot") is results.Result.plot  # noqa: B009
 
 
 def test_slots_without_an_orbit_are_in_no_table_and_no_picture(tmp_path: Path):

@@ -41,16 +41,3 @@ def test_each_impact_comes_r_times_as_fast_as_the_one_before_and_all_energy_is_l
     lost = np.asarray(bounced.contacts.energy_lost_aj)[:count].sum()
     # the impacts that are summed up have speeds below 1e-6 of the first
     np.testing.assert_allclose(lost, 0.5 * first**2, rtol=1e-10)
-
-
-def test_room_that_was_told_is_not_exceeded():
-    found = simulate(SCENE, state(0.0, START_NM, 0.0), 100.0, max_contacts=38)
-    assert int(found.outcome) == MotionOutcome.CONTACT_LIMIT
-    assert int(found.count) == found.contacts.kind.shape[0] == 38
-
-
-def test_durations_share_a_program(bounced):
-    room = bounced.contacts.kind.shape[0]
-    assert simulate(SCENE, state(0.0, START_NM, 0.0), 97.0).contacts.kind.shape[0] == room
-    # a power of two
-    assert room & (room - 1) == 0

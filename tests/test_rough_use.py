@@ -3,12 +3,9 @@
 import contextlib
 import itertools
 import os
-import re
 import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import click
@@ -18,10 +15,9 @@ from click.testing import CliRunner
 
 from afm_jax.cli.main import main
 from afm_jax.studies.sweep import STORE
-from afm_jax.whole_files import read_whole, write_whole
-from tests.fresh_python import outputs
+from afm_jax.whole_files import write_whole
 from tests.fuzz import fuzz_files, fuzz_orbits
-from tests.test_imports import LIBRARY, ROOT
+from tests.test_imports import ROOT
 from tests.writing_commands import CALLS, prepare, unchecked
 
 LAW = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n[platform]\namplitude_nm = {}\nreduced_frequency = {}\n"
@@ -85,15 +81,6 @@ def test_a_full_device_and_a_full_standard_output_are_named(tmp_path):
     assert (silent.returncode, silent.stdout[:8]) == (0, "afm-jax ")
 
 
-def test_nothing_writes_files_another_way():
-    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w|\.to_(csv|zarr|json)\(")
-    # into new folders that `whole_folder` then puts in their place
-    new = re.compile(r"open_group\(str\((fresh|path)\)")
-    found = {str(path) for path in LIBRARY if other.search(new.sub("", (ROOT / path).read_text(encoding="utf-8")))}
-    # the writer itself, and a standard error that is closed
-    assert found == {"afm_jax/whole_files.py", "afm_jax/cli/main.py"}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("call", CALLS)
 def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
@@ -112,36 +99,6 @@ def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
         assert (code, "is a link, which is not followed" in said, (tmp_path / "letter").exists()) == (2, True, False)
         whole.unlink()
         kept.rename(whole)
-
-
-def test_a_table_named_by_the_user_may_be_a_link_but_no_numbered_one(tmp_path):
-    (tmp_path / "link.csv").symlink_to(tmp_path / "meant.csv")
-    assert run("read", *CALLS["read"], "--out", tmp_path / "link.csv").exit_code == 0
-    assert (tmp_path / "link.csv").is_symlink()
-    assert (tmp_path / "meant.csv").read_text(encoding="utf-8").startswith("#")
-    (tmp_path / "tables").mkdir()
-    (tmp_path / "tables" / "curve.csv").symlink_to(tmp_path / "other.csv")
-    refused = run("read", *CALLS["read"], "--out", tmp_path / "tables")
-    assert (refused.exit_code, (tmp_path / "other.csv").exists()) == (2, False)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
-def test_a_pipe_is_read_until_its_writer_leaves(tmp_path):
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-
-    def write() -> None:
-        with pipe.open("wb") as file:
-            for part in parts:
-                file.write(part)
-                file.flush()
-                time.sleep(0.1)
-
-    parts = [b"a" * 300_000, b"b", b"c" * 100_000]
-    writer = threading.Thread(target=write)
-    writer.start()
-    assert read_whole(pipe) == b"".join(parts)
-    writer.join()
 
 
 BAD_NUMBERS = ("nan", "inf", "-inf", "1e400", "1:nan:2", "0:inf:1", "r=nan", "40 +- nan", "r=1+-inf", "1:1e400")
@@ -181,21 +138,13 @@ def test_no_message_quotes_a_name_of_any_length_or_what_commands_the_terminal(tm
     assert "\x1b" not in run("fit", tmp_path / "none\x1b.csv").output
 
 
-COMMAND = """
-import atexit, os, signal, sys, time
+DEAF = """
+import signal, sys, time
+import tests.trial_commands
 from afm_jax.cli.command import Command
 from afm_jax.cli.main import COMMANDS, main
 # a job in the background of a shell is born deaf
 signal.signal(signal.SIGINT, signal.default_int_handler)
-{}
-import tests.trial_commands
-tests.trial_commands.body = command
-COMMANDS["rough"] = Command("rough", "Check", "tests.trial_commands:trial", computes=False)
-sys.argv[1:] = ["rough"]
-main()
-"""
-"""A program with one more command."""
-DEAF = """
 class Lost:
     def __del__(self):
         raise KeyboardInterrupt
@@ -210,37 +159,16 @@ def command(session):
         except KeyboardInterrupt:
             # as in the callbacks of a garbage collection: nobody hears it
             Lost()
+tests.trial_commands.body = command
+COMMANDS["rough"] = Command("rough", "Check", "tests.trial_commands:trial", computes=False)
+sys.argv[1:] = ["rough"]
+main()
 """
-LEAVING = """
-# as of JAX's threads, which still compute while the interpreter is taken down
-atexit.register(lambda: os.kill(os.getpid(), signal.SIGSEGV))
-def command(session):
-    print("whole")
-    raise KeyboardInterrupt
-"""
-IMPORTING = """
-def command(session):
-    try:
-        import taken_for_a_fault
-    except BaseException:
-        # as NumPy does, which then tries another way
-        raise RecursionError
-"""
-
-
-def test_an_interrupted_program_leaves_before_its_threads_can_crash_it():
-    printed, said = outputs(COMMAND.format(LEAVING), {}, codes=(130,))
-    assert (printed, said.strip()) == ("whole", "afm-jax: interrupted")
-
-
-def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
-    (tmp_path / "taken_for_a_fault.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
-    there = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    assert outputs(COMMAND.format(IMPORTING), there, codes=(130,)) == ("", "afm-jax: interrupted\n")
+"""A program with one more command."""
 
 
 def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
-    call = [sys.executable, "-c", COMMAND.format(DEAF)]
+    call = [sys.executable, "-c", DEAF]
     with subprocess.Popen(call, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
@@ -250,33 +178,6 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
         finally:
             process.kill()
     assert (process.returncode, said) == (130, "afm-jax: interrupted\n")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no list of a process's children")
-def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_own_without_a_word():
-    # as a terminal does, to the whole group; started so that interrupts are heard even from the background
-    # not by an import, in which an interrupt ends the program at once
-    code = (
-        "import runpy, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "sys.argv = ['afm-jax', 'accuracy', 'map']\nrunpy.run_module('afm_jax', run_name='__main__')"
-    )
-    call, deadline = [sys.executable, "-c", code], time.monotonic() + 100.0
-    with subprocess.Popen(call, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-        while not (child := children.read_text(encoding="ascii").split()[:1]) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        time.sleep(6.0)
-        os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "Traceback" not in said
-    assert said.splitlines()[-1] == "afm-jax: interrupted"
-    # gone, or dead and waiting for whoever collects what is left over
-    place, deadline = Path(f"/proc/{child[0]}/stat"), time.monotonic() + 10.0
-    while place.exists() and place.read_text().rsplit(")", 1)[1].split()[0] != "Z" and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert time.monotonic() < deadline
 
 
 @pytest.mark.slow

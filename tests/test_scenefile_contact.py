@@ -1,21 +1,16 @@
 """Scene files with a contact: every key and exact loops; mistakes are lines of the corpus (`tests.malformed`)."""
 
-import inspect
-import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, Contact, Platform, Scene, load_scene, save_scene
-from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
-from afm_jax.contact.parameters import CONTACT_RANGES, DRY_PARAMETERS, EFFECTS, PAPER
+from afm_jax.contact.parameters import EFFECTS, PAPER
 
 HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"
 CONTACT = HEAD + 'model = "contact"\n'
@@ -26,12 +21,6 @@ CHANGED: dict[str, Any] = {name: 1.01 * value for name, value in PAPER.items()}
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "scene.toml"
-
-
-def test_keys_and_ranges_are_those_of_the_contact():
-    keywords = (inspect.getdoc(Contact.paper) or "").partition("left out:")[2].partition("Raises:")[0]
-    assert set(PAPER) == set(re.findall(r"^ +(\w+): ", keywords, re.MULTILINE))
-    assert {*PAPER, *(parameter.name for parameter in DRY_PARAMETERS)} == set(CONTACT_RANGES)
 
 
 def test_effects_are_chosen_in_any_order_and_what_is_left_out_is_the_papers(path: Path):
@@ -72,26 +61,3 @@ def test_loop_is_exact(values: dict[str, Any], tmp_path_factory: pytest.TempPath
         **values,
         "core_constant_j_m6": pytest.approx(values["core_constant_j_m6"], rel=1e-15),
     }
-
-
-def test_loop_is_exact_in_32_bits(path: Path):
-    with jax.enable_x64(False):  # noqa: FBT003
-        scene = Scene(Cantilever(90.0), Platform(4.0, 181.8), Contact.paper(core_constant_j_m6=2.3e-78))
-        assert scene.interaction.bridge_forms_nm.dtype == jnp.float32
-        save_scene(scene, path)
-        assert eqx.tree_equal(load_scene(path), scene)
-
-
-@pytest.mark.parametrize(
-    ("contact", "said"),
-    [
-        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "with 'van_der_waals' must hold 'dmt'"),
-        (Contact(CoreRepulsion(), junction=Jkr(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
-        (Jkr(), "holds an ImpactLaw or a Contact as interaction, not Jkr"),
-        (Contact.paper(relative_humidity=jnp.array([0.4, 0.5])), r"has shape \(2,\), but a scene file holds one scene"),
-    ],
-)
-def test_what_the_format_has_no_key_for_is_not_saved(path: Path, contact: Any, said: str):
-    with pytest.raises((ValueError, TypeError), match=said):
-        save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), contact), path)
-    assert not path.exists()

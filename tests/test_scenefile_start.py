@@ -1,11 +1,11 @@
-"""The start of a scene file: kept exactly, and not saved where a tip cannot begin."""
+"""The start of a scene file: kept exactly."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
+from afm_jax import load_scene, save_scene
 from afm_jax.scenefile.scenefile import Start, read_scene
 
 HEAD = (
@@ -45,14 +45,3 @@ def test_loop_is_exact(path: Path, interaction: str, start: Start):
     assert read_scene(path).start == start
     save_scene(scene, path)
     assert read_scene(path).start is None
-
-
-def test_a_start_that_cannot_be_is_not_saved(path: Path):
-    platform = Platform(4.0, 180.0)
-    for interaction, said in (
-        (Contact.paper(), "`height_above_platform_nm` must be positive"),
-        (ImpactLaw(0.9), "below the platform's 4.52389"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            save_scene(Scene(Cantilever(90.0), platform, interaction), path, start=Start(270.0, 0.0, 1.0))
-        assert not path.exists()

@@ -1,26 +1,17 @@
 """Several tables fitted together: one law, nuisances of each, pulls and scatter, against direct calculations."""
 
 import dataclasses
-import json
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-import fitting
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.saved import save
-from fitting.experiments.prior import prior_of_fit
 from fitting.infer.fit import fit
-from fitting.infer.result import FitResult, FittedTable
 from fitting.infer.several import Parts, pulls_of
-from fitting.report.report import row_records, summary
-from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.fit_tables import example_amplitudes, rows, simulated, standard_errors_of, values_of
-from tests.made_fits import made_fit, made_parameter, made_rows, made_table
 from tests.test_driven_orbits import driven
 
 TABLES, READINGS = 5, 24
@@ -91,53 +82,6 @@ def test_tables_of_one_law_are_seldom_far_from_the_others():
 def cut(table: AmplitudeTable, count: int) -> list[AmplitudeTable]:
     """Return every so-many-th row of a table as a table of its own."""
     return [rows(table, np.arange(table.rows)[i::count], source=f"part{i}.csv") for i in range(count)]
-
-
-def test_names_tell_tables_apart():
-    for sources, names in (
-        (("x/a.csv", "x/b.csv"), ("a.csv", "b.csv")),
-        (("x/a.csv", "y/a.csv"), ("x/a.csv", "y/a.csv")),
-        (("a.csv", "a.csv"), ("a.csv (1)", "a.csv (2)")),
-    ):
-        assert SeveralTables(tuple(made_table(source=source) for source in sources)).labels == names
-
-
-@pytest.mark.parametrize(
-    ("changes", "options", "message"),
-    [
-        ({"mass_ng": 2.0}, {}, "mass_ng is 1 in a.csv and 2 in b.csv: tips of different mass share no law"),
-        ({"quality_factor": 41.0}, {"share": ["quality_factor"]}, "a.csv says 40 \\+- 0.4, and b.csv says 41 \\+- 0.4"),
-        ({}, {"share": ["all"], "constraints": {"quality": (1.0, 0.1)}}, "the constraint on 'quality' is on no"),
-        ({}, {}, "b.csv holds the same readings as a.csv; give each table once"),
-    ],
-)
-def test_what_tables_cannot_share_is_said(changes: dict, options: dict, message: str):
-    with pytest.raises(ValueError, match=message):
-        fit([made_table(source="a.csv"), made_table(source="b.csv", **changes)], **options)
-
-
-def made_joint() -> FitResult:
-    """Return a fit of two tables."""
-    both = SeveralTables((made_table(source="a.csv"), made_table(source="b.csv", mass_ng=1.001)))
-    own = {"quality_factor": made_parameter("quality_factor", 40.0)}
-    one = FittedTable("a.csv", 4, 4, 3.0, 7, 1.25, 0.2, own)
-    other = dataclasses.replace(one, name="b.csv", pull=np.nan, p_value=np.nan)
-    all_rows = dataclasses.replace(made_rows(made_table(8)), reasons=("",) * 8)
-    found = made_fit("law", rows=all_rows)
-    return dataclasses.replace(found, table=both, tables=(one, other))
-
-
-def test_reports_say_each_tables_pull(tmp_path: Path):
-    result = made_joint()
-    said = " ".join(summary(result).split())
-    assert "a.csv 4/4 3.0/7 1.25 b.csv 4/4 3.0/7 -" in said
-    assert row_records(result)[5] | {"table": "b.csv", "line": 2} == row_records(result)[5]
-    # saved and read again, and as a prior
-    save(result, tmp_path / "fit.json")
-    again = fitting.load(tmp_path / "fit.json")
-    assert (again.tables[0].pull, np.isnan(again.tables[1].pull)) == (1.25, True)
-    assert again.table.labels == ("a.csv", "b.csv")
-    assert prior_of_fit(json.loads((tmp_path / "fit.json").read_text())).measured.shape == (8, 4)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""`afm-jax simulate`: its numbers against orbits of the impact law, its files, and its refusals."""
+"""`afm-jax simulate`: its numbers against orbits of the impact law, and its files."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
-from afm_jax.apparatus.drives import ForceDrive
 from afm_jax.cli.main import main
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.scenefile import Start
@@ -78,22 +77,6 @@ def test_the_text_says_the_same(law_file: Path):
 
 
 @pytest.mark.slow
-def test_a_part_of_a_response_period_has_no_mean(law_file: Path):
-    answer = json_of(law_file, "--duration-us", 3, "--harmonics", "1,2")
-    assert answer["window"]["responses"] == 0
-    # too short to settle is no failure
-    assert (answer["settled"], answer["order"]) == (False, None)
-    assert "no sequence" in answer["settled_reason"]
-    assert nulls(answer) == answer["null_reasons"].keys()
-    short = {name for name, reason in answer["null_reasons"].items() if "shorter than a response period" in reason}
-    assert short >= {"lockin_amplitude_nm", "mean_height_nm", "virial_aj", "drive_lockin_phase_deg"}
-    assert all(harmonic["amplitude_nm"] is None for harmonic in answer["harmonics"])
-    # the highest it has been is known
-    assert answer["peak_amplitude_nm"] > 0.0
-    assert "Less than a response period" in simulate(law_file, "--duration-us", 3).stdout
-
-
-@pytest.mark.slow
 def test_lockin_reads_the_trace_it_writes(tmp_path: Path):
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 3.0 * 181.8, -1.0), LAW.interaction)
     save_scene(scene, tmp_path / "scene.toml")
@@ -120,25 +103,3 @@ def test_a_tip_too_slow_sticks(tmp_path: Path):
     # it rests within the range of the junction: between the deepest static gap and where the junction breaks
     assert abs(answer["final"]["position_nm"]) < 2.0
     assert nulls(answer) == answer["null_reasons"].keys()
-
-
-@pytest.mark.slow
-def test_the_drives_frequency_is_read_and_named_whatever_harmonics_are_asked_for(tmp_path: Path):
-    path = tmp_path / "forced.toml"
-    law, force = ImpactLaw(0.99, 0.1, 0.01), ForceDrive(45.7, 545.4)
-    save_scene(Scene(Cantilever(90.0, 40.0), Platform(0.0, 33.0, -1.0), law, force=force), path)
-    several = [json_of(path, "--harmonics", asked) for asked in ("1", "3,4,6")]
-    keys = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
-    for answer in several:
-        assert answer["order"] == 3
-        # neither is one of those asked for, nor depends on them
-        assert [answer[key] for key in keys] == [several[0][key] for key in keys]
-        assert answer["response_frequency_khz"] == pytest.approx(181.8, rel=1e-12)
-    third = several[1]["harmonics"][0]
-    assert (third["multiple"], third["amplitude_nm"]) == (3, several[0]["drive_lockin_amplitude_nm"])
-    assert third["frequency_khz"] == pytest.approx(545.4, rel=1e-12)
-    # lines are broken where a terminal ends
-    said = " ".join(simulate(path, "--harmonics", "3,4,6").stdout.split())
-    assert "At the drive's frequency (545.4 kHz): {drive_lockin_amplitude_nm:.6g} nm, ".format(**several[0]) in said
-    assert "At 4 times the response frequency (727.2 kHz, 4/3 of the drive's): " in said
-    assert "at the drive's frequency: {phase_lag_deg:.6g} deg.".format(**several[0]) in said

@@ -14,7 +14,6 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.motion.record import MotionOutcome, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import DensePath, trajectory
-from afm_jax.scenefile.presets import contact_scene
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
 
@@ -126,21 +125,6 @@ def test_dense_output_agrees_with_an_independent_integration():
 
 
 @pytest.mark.slow
-def test_a_batch_says_which_of_its_scenes_has_no_junction():
-    system = reference(5.277, 4.0)
-    start = state(began(system, 60.0))
-
-    def one_of_many(adhesion):
-        scene = scene_of(system, Contact.paper(adhesion_energy_j_per_m2=adhesion))
-        return simulate(scene, start, 20.0, max_contacts=ROOM)
-
-    many, alone = jax.jit(jax.vmap(one_of_many))(jnp.array([0.3, 0.05])), one_of_many(0.3)
-    assert many.outcome.tolist() == [MotionOutcome.FINISHED, MotionOutcome.NO_JUNCTION]
-    # the same steps, summed in another order
-    np.testing.assert_allclose(many.contacts.arrival_time_us[0], alone.contacts.arrival_time_us, rtol=0.0, atol=1e-10)
-
-
-@pytest.mark.slow
 def test_derivatives_forward_and_reverse_alone_and_in_a_batch():
     at, speeds = jnp.array([0.1, 1.005e-3, 40.0]), jnp.array([40.0, 60.0])
     start = began(reference(5.277, 4.0), 60.0)
@@ -170,9 +154,3 @@ def test_derivatives_forward_and_reverse_alone_and_in_a_batch():
             slope = (independent(at + shift, speed) - independent(at - shift, speed)) / (2.0 * step)
             # rounding of the differences: 1e-12 us over the steps
             np.testing.assert_allclose(forward[row, place], slope, rtol=1e-5, atol=1e-9)
-
-
-def test_too_little_room_is_an_outcome():
-    simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 600.0, max_contacts=ROOM)
-    assert int(simulation.outcome) == MotionOutcome.CONTACT_LIMIT
-    assert int(simulation.count) == ROOM

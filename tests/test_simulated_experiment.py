@@ -1,8 +1,5 @@
 """Simulated experiments: tables of the full contact, and of a law whose orbits are known in closed form."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,13 +11,11 @@ from fitting.simulated.experiment import Drives, drives_of, simulate_experiment,
 from fitting.tables.table import read_table
 from tests.contact_experiment import paper_experiment
 from tests.fit_tables import steady_readings
-from tests.tapping_truths import MASS_NG, tapping_truth
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
 
 MEASURED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
-ON_RESONANCE = ("free_amplitude_nm", "offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
 ROWS = ((1, 177.3, 4.0, 1.0), (1, 180.0, 4.0, 0.0), (2, 349.2, 4.0, -1.0), (3, 545.4, 4.0, 0.0))
 LAW = ImpactLaw(0.97, 60.0, 0.3, CollisionDelay(0.2, 5.6, 0.6))
 
@@ -77,30 +72,3 @@ def test_noise_has_the_size_that_the_table_states(of_a_law):
         apart = np.array([getattr(table, name) for table in noisy]) - getattr(exact, name)
         # of 500 draws the standard deviation is known to 3 %; rounding to six digits adds nothing
         np.testing.assert_allclose(apart.std(axis=0), getattr(exact, f"{kind}_error_{unit}"), rtol=0.15)
-
-
-def test_impossible_experiments_are_refused():
-    for changed, said in (
-        ({"noise": 1.5}, "`noise` must be between 0 and 1"),
-        ({"phase_noise_deg": 0.0}, "`phase_noise_deg` must be between 0 and 90"),
-        ({"drives": drives_of([(0, 180.0, 2.0, 0.0)])}, "orders of 1 or more"),
-        # far off every resonance and slower than capture
-        ({"drives": drives_of([(1, 250.0, 0.2, 0.0)])}, "no drive has a steady single-impact orbit"),
-    ):
-        wanted: Any = {"drives": drives_of(ROWS), "noise": 0.01, "phase_noise_deg": 0.1} | changed
-        with pytest.raises(ValueError, match=said):
-            simulate_experiment(LAW, Cantilever(90.0, 40.0), **wanted)
-
-
-def test_taps_on_resonance_are_found_without_the_law():
-    truth = tapping_truth(0)
-    kept = read_table(Path(__file__).parent / "tapping_tables/tapping_712_0_1_8.csv")
-    chosen = [0, 6, 10]
-    of = {name: np.asarray(getattr(kept, name))[chosen] for name in ON_RESONANCE}
-    drives = [(1, 90.0, *row) for row in zip(of["free_amplitude_nm"], of["offset_nm"], strict=True)]
-    contact, cantilever = Contact.paper(**truth.parameters), Cantilever(90.0, truth.quality_factor, MASS_NG)
-    made = simulate_experiment(contact, cantilever, drives_of(drives), drive="force", phase_noise_deg=0.2)
-    assert not made.left_out
-    # kept were those made from other starts
-    for name in ("lockin_amplitude_nm", "phase_lag_deg"):
-        np.testing.assert_allclose(np.asarray(getattr(made.exact, name)), of[name], rtol=0.0, atol=2e-3)

@@ -1,14 +1,10 @@
-"""The site: whole, strict, nothing fetched from other machines; its search works in a browser."""
+"""The site: whole, strict, nothing fetched from other machines."""
 
 import os
 import re
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,10 +12,6 @@ from notebooks.make_pictures import PICTURES
 from notebooks.run_notebooks import NOTEBOOKS
 
 ROOT = Path(__file__).parent.parent
-CHROMIUM = next(
-    (place for name in ("chromium", "chromium-browser", "google-chrome") if (place := shutil.which(name))), ""
-)
-needs_browser = pytest.mark.skipif(not (CHROMIUM and find_spec("playwright")), reason="no Chromium, or no playwright")
 UNTESTED_NOTEBOOKS = """
 import shutil, sys
 from pathlib import Path
@@ -49,15 +41,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-@pytest.fixture
-def page() -> Iterator[Any]:
-    """A page of a browser."""
-    with pytest.importorskip("playwright.sync_api").sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser.new_page(viewport={"width": 1400, "height": 1000})
-        browser.close()
-
-
 def test_pictures_stand_beside_their_commands():
     pages = ROOT / "notebooks" / "pages"
     text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
@@ -82,14 +65,3 @@ def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: P
     assert "(pictures/figure3.svg)" in (ROOT / "notebooks" / "pages" / "index.md").read_text(encoding="utf-8")
     assert "capture_speed" in (site / "api.html").read_text(encoding="utf-8")
     assert "--scale-errors" in (site / "commands.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-@needs_browser
-def test_search_works_from_disk(site: Path, page: Any):
-    asked: list[str] = []
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto((site / "index.html").as_uri())
-    page.locator("input.md-search__input").press_sequentially("capture speed")
-    page.locator(".md-search-result__item").first.wait_for(timeout=60_000)
-    assert {url.partition(":")[0] for url in asked} <= {"file", "data", "blob", "about"}

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, in_blocks, map_in_blocks, power_of_two
-from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows
 from afm_jax.solve.quadrature import gauss_nodes, mean_matrix, series_tail
 
 VALUES = np.arange(1.0, 24.0)
@@ -98,11 +96,6 @@ def pair(x, p):
     return jnp.stack([x[0] * x[1] - 0.5 * p[0], x[0] ** 2 + x[1] - p[1]])
 
 
-def below_a_fold(x, p):
-    """Return two equations with roots x = +-sqrt(p) that meet at p = 0."""
-    return jnp.stack([x[0] ** 2 - x[1], x[1] - p])
-
-
 EXACT = Newton(rounds=30, step_tolerance=1e-12, residual_tolerance=1e-13)
 
 
@@ -124,22 +117,6 @@ def test_newton_finds_scipys_root_with_the_derivatives_of_differences(equations,
     several = jnp.stack([p, p + 0.1, p - 0.1])
     alone = np.stack([root(each).x for each in several])
     np.testing.assert_allclose(jax.vmap(root)(several).x, alone, rtol=1e-14)
-
-
-def test_a_fold_and_what_is_beyond_it_are_told():
-    def root(p, guess=(1.0, 1.0)):
-        return newton(below_a_fold, jnp.asarray(guess), jnp.asarray(p), EXACT)
-
-    np.testing.assert_allclose(root(0.25).x, [0.5, 0.25], rtol=1e-14)
-    assert jax.grad(lambda p: root(p).x[0])(0.25) == pytest.approx(1.0, rel=1e-14)
-    assert jax.grad(jax.grad(lambda p: root(p).x[0]))(0.25) == pytest.approx(-2.0, rel=1e-13)
-    # at the fold each step halves the distance: 30 are not enough; beyond it there is nothing
-    assert root(0.0).outcome == root(-0.25).outcome == NewtonOutcome.NOT_CONVERGED
-    assert float(root(0.0).x[0]) == pytest.approx(0.5**30, rel=1e-6)
-    # df/dx is singular where x = 0
-    stuck = root(0.25, (0.0, 1.0))
-    assert stuck.outcome == NewtonOutcome.NO_STEP
-    np.testing.assert_array_equal(stuck.x, [0.0, 1.0])
 
 
 def test_slots_end_one_by_one_within_their_domain():
@@ -189,24 +166,6 @@ def test_rows_are_solved_each_on_its_own():
     assert double.x[0, 0] == pytest.approx(0.5**30, rel=1e-12)
 
 
-def test_halved_and_shortened_steps_come_back():
-    rows = np.array([[3.0], [-45.0]])
-    halved = newton_rows(arctangents(), rows, EXACT._replace(halvings=8))
-    assert halved.converged.all()
-    np.testing.assert_allclose(halved.x, 0.0, atol=1e-15)
-    shorter = EXACT._replace(damping=lambda x, step: shortened(step, np.full_like(x, 1.0)), rounds=60)
-    np.testing.assert_allclose(newton_rows(arctangents(), rows, shorter).x, 0.0, atol=1e-15)
-    np.testing.assert_allclose(shortened(np.array([3.0, -4.0]), np.array([1.0, 8.0])), [1.0, -4.0 / 3.0])
-
-    def minimum(x, _):
-        # x^2 + 1 has no root, and x = 0 no step
-        return LinearisedRows(x**2 + 1.0, (2.0 * x)[:, :, None])
-
-    lost = newton_rows(minimum, np.array([[0.3], [0.0]]), EXACT._replace(halvings=3))
-    assert lost.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NO_STEP]
-    assert abs(lost.x[0, 0]) <= 0.3
-
-
 def circle(point: np.ndarray) -> EquationsAt | None:
     """Return a circle of radius 2: it turns back in its last unknown at (0, 2)."""
     x, y = point
@@ -231,15 +190,6 @@ def test_a_curve_is_followed_round_its_fold():
         turned += np.arcsin(length / 2.0)
         np.testing.assert_allclose(step.x, 2.0 * np.array([np.cos(turned), np.sin(turned)]), atol=1e-8)
         here, tangent = step.x, step.tangent
-
-
-def test_a_plane_without_a_point_of_the_curve_is_no_answer():
-    aside = np.array([1.0, 0.0])
-    assert point_in_plane(circle, np.array([3.5, 0.0]), aside, IN_PLANE) is None
-    # Newton's method wanders where plane and circle do not meet
-    assert point_in_plane(circle, np.array([2.5, 0.1]), aside, IN_PLANE) is None
-    # a normal along the equations' own gradient leaves the system singular
-    assert point_in_plane(circle, np.array([0.0, 2.1]), np.array([0.0, 1.0]), IN_PLANE) is None
 
 
 def test_the_largest_value_has_the_slope_of_one_of_them():
@@ -301,22 +251,3 @@ def test_quadrature_of_polynomials_is_exact():
     # P_4 of 2 x - 1 begins with 70 x^4
     assert float(series_tail(jnp.asarray(points**3))) == pytest.approx(1.0 / 20.0, rel=1e-13)
     assert float(series_tail(jnp.asarray(70.0 * points**4 - 140.0 * points**3))) == pytest.approx(1.0, rel=1e-12)
-
-
-@pytest.mark.slow
-def test_slopes_of_a_contacts_table_do_not_hang_on_how_its_barrier_is_rounded():
-    # the barrier is the largest of many energies: computed twice by an XLA told to hurry, none was the largest
-    def table(humidity):
-        return tabulated(Contact.paper(relative_humidity=humidity), jnp.asarray(1.0)).lowest
-
-    def both(humidity):
-        return jax.jvp(table, (humidity,), (jnp.asarray(1.0),))
-
-    hurried = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
-    try:
-        quick = jax.jit(both, compiler_options=hurried).lower(0.5).compile()
-    except jax.errors.JaxRuntimeError:
-        pytest.skip("this XLA does not know the options")
-    for humidity in (0.499, 0.49975, 0.501):
-        near = [float(quick(jnp.asarray(humidity + shift))[0]) for shift in (-1e-4, 1e-4)]
-        assert float(quick(jnp.asarray(humidity))[1]) == pytest.approx((near[1] - near[0]) / 2e-4, rel=1e-5)

@@ -1,12 +1,7 @@
-"""Sweeps for real: against the functions they record, over devices and processes, killed, on a full disk."""
+"""Sweeps for real: against the functions they record, over processes, and points without a result."""
 
-import contextlib
 import json
 import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +18,9 @@ from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.scenefile import Start, load_scene, scene_tables
 from afm_jax.solve.lanes import LANES, filled
 from afm_jax.studies.sweep import STORE, plan_of, run_plan, sweep
-from tests.kills import ROOT, chunks_done
 
 FREQUENCY, AMPLITUDE = "platform.reduced_frequency", "platform.amplitude_nm"
 PLANE = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 9]}, {"parameter": FREQUENCY, "linear": [0.8, 2.2, 15]}]
-NUMBERS = [sys.executable, "-m", "tests.sweep_numbers"]
 
 
 @pytest.fixture(autouse=True)
@@ -57,22 +50,6 @@ def test_orbits_are_those_of_single_impact_orbits():
             np.testing.assert_allclose(there[name], np.where(good.any(axis=1), highest, np.nan), rtol=1e-8)
         seen += good.any(axis=1).sum()
     assert seen > 10
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_orbits_of_a_contact_are_those_that_simulations_end_in():
-    axes = [{"parameter": FREQUENCY, "list": [2.1]}, {"parameter": AMPLITUDE, "list": [0.0, 8.0]}]
-    scene = load_scene("figure8")
-    found = sweep(scene, axes, {"what": "orbits", "orders": [1, 2]}).isel(platform_reduced_frequency=0)
-    ends = sweep(scene, axes, {"what": "simulation", "periods": 1000.0}).isel(platform_reduced_frequency=0)
-    assert found["stable"].values.tolist() == [[False, False], [False, True]]
-    assert (bool(ends["settled"][1]), int(ends["order"][1]), int(ends["contacts_per_response"][1])) == (True, 2, 1)
-    # the accuracy of contacts in search of orbits
-    np.testing.assert_allclose(found["peak_amplitude_nm"][1, 1], ends["peak_amplitude_nm"][1], rtol=1e-6)
-    assert float(found["largest_multiplier"][1, 1]) < 1.0
-    why = found["message"].values.tolist()
-    assert (why[0].startswith("`amplitude_nm` of the platform must be positive here"), why[1]) == (True, "")
 
 
 @pytest.mark.slow
@@ -107,26 +84,6 @@ def test_workers_give_what_one_process_does(tmp_path: Path, monkeypatch: pytest.
     one, two = (xarray.open_zarr(str(tmp_path / folder / STORE)).load() for folder in ("one", "two"))
     # last digits may differ: programs share the cores otherwise
     xarray.testing.assert_allclose(one, two, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_an_interrupt_is_one_message(tmp_path: Path):
-    (tmp_path / "out").mkdir()
-    line = [*NUMBERS, str(tmp_path / "out"), json.dumps({"seconds": 2.0})]
-    # twenty-eight seconds of work: it has not ended when it is interrupted, however busy the machine
-    # the keyboard interrupts the whole group of processes
-    with subprocess.Popen(line, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
-        while process.poll() is None and chunks_done(tmp_path / "out") < 1:
-            time.sleep(0.05)
-        told = None
-        while told is None:
-            # Python drops an interrupt that falls into the end of an object: who waits presses the keys again
-            os.killpg(process.pid, signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                told = process.communicate(timeout=15)[1]
-    assert process.returncode != 0, told
-    assert told.count("Traceback") <= 1, told
-    assert told.splitlines()[-1] == "KeyboardInterrupt", told
 
 
 def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

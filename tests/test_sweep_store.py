@@ -2,28 +2,21 @@
 
 import errno
 import json
-import os
 import shutil
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray
 
-from afm_jax.plots.sweeps import sweep_figure
-from afm_jax.scenefile.scenefile import load_scene, scene_tables
-from afm_jax.studies import sweep as sweeps
 from afm_jax.studies.sweep import (
     FORMAT_VERSION,
     STORE,
     SweepPlan,
     axes_of,
-    compute_chunk,
-    plan_of,
     run_plan,
 )
-from tests.sweep_numbers import SIZES, contents, plan, recorder
+from tests.sweep_numbers import SIZES, contents, plan
 
 X, Y = np.linspace(0.0, 6.0, SIZES[0]), np.linspace(0.0, 11.0, SIZES[1])
 SUM = X[:, None] + 0.1 * Y
@@ -55,13 +48,6 @@ def test_results_open_with_xarray_alone(whole: Path):
     given = json.loads(found.attrs["input"])
     assert given["axes"][1] == {"parameter": "y", "linear": [0.0, 11.0, 12]}
     assert {"jax", "afm-jax", "numpy"} <= set(given["versions"])
-
-
-def test_points_without_a_result_say_why(tmp_path: Path):
-    run_plan(plan(explained=True), tmp_path)
-    with warnings.catch_warnings(action="error"):
-        found = xarray.open_zarr(str(tmp_path / STORE)).load()
-    np.testing.assert_array_equal(found["message"], np.where(SUM < 2.0, "the sum is below 2 \u00e4", ""))
 
 
 def results(folder: Path, wanted: SweepPlan) -> xarray.Dataset:
@@ -155,17 +141,6 @@ def test_a_folder_with_links_is_refused_and_nothing_outside_it_changes(
     assert [path.read_text() for path in mine.iterdir()] == ["mine"] * 4
 
 
-def test_pipes_are_refused(swept: Path, tmp_path: Path):
-    for name in (f"{STORE}/computed/c/2/1", f"{STORE}/sum_nm/c/3/0"):
-        place = swept / name
-        kept = place.rename(tmp_path / "kept")
-        os.mkfifo(place)
-        with pytest.raises(OSError, match="is a device or a pipe, not a file; delete it") as refused:
-            run_plan(plan(), swept)
-        assert refused.value.filename == str(place)
-        kept.replace(place)
-
-
 def test_axes_are_what_they_say():
     random = {"random": {"c": [0.0, 2.0], "d": {"log": [1.0, 10.0]}}, "count": 1001, "seed": 5}
     log, listed, first, second = axes_of(
@@ -184,27 +159,3 @@ def test_axes_are_what_they_say():
     assert abs(np.corrcoef(c, d)[0, 1]) < 0.1
     assert abs(np.median(d) / np.sqrt(10.0) - 1.0) < 0.2
     assert (d.min() >= 1.0, d.max() <= 10.0) == (True, True)
-
-
-def test_a_worker_with_other_versions_is_refused(monkeypatch: pytest.MonkeyPatch):
-    # a worker is a process of its own; this one keeps its settings
-    for name in ("open_cache", "silence_xla"):
-        monkeypatch.setattr(sweeps, name, lambda: None)
-    axes = [{"parameter": "platform.amplitude_nm", "list": [1.0]}]
-    given = plan_of({"scene": scene_tables(load_scene("figure2")), "axes": axes, "record": {"what": "orbits"}}).given
-    other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
-    with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
-        compute_chunk(json.dumps(other), (slice(0, 1),))
-
-
-@pytest.mark.parametrize("log", [False, True])
-def test_a_picture_shows_all_that_was_swept(tmp_path: Path, log: bool):  # noqa: FBT001
-    line = {"parameter": "x", "log": [1.0, 16.0, 5]} if log else {"parameter": "x", "linear": [1.0, 16.0, 5]}
-    given = plan().given | {"axes": [line, {"parameter": "y", "linear": [0.0, 10.0, 11]}]}
-    found = results(tmp_path, plan_of(given, recorder))
-    lines, plane = (sweep_figure(shown, ["sum_nm"]).axes[0] for shown in (found.isel(y=0, drop=True), found))
-    assert lines.get_xscale() == plane.get_yscale() == ("log" if log else "linear")
-    low, high = lines.get_xlim()
-    assert (low < 1.0, high > 16.0) == (True, True)
-    # the first cell reaches from as far below its value as the second from above
-    assert plane.get_ylim()[0] == pytest.approx(2.0**-0.5 if log else 1.0 - 0.5 * 15.0 / 4.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from afm_jax.scenefile.scenefile import SceneError, load_scene
-from fitting.tables.csv_text import Source, TableError, column_of
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import read_table, write_table
-from tests.test_table import KEY, TEXT, read, small_table
+from tests.test_table import KEY, read, small_table
 
 
 def test_paths_that_are_no_file(tmp_path: Path):
@@ -44,13 +44,6 @@ def test_a_flood_of_unknown_columns_is_refused_at_once(tmp_path: Path):
     assert time.process_time() - start < 5.0
 
 
-def test_noise_is_a_fraction(tmp_path: Path):
-    for noise in (0.0, 1.0):
-        said = f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %"
-        with pytest.raises(TableError, match=said):
-            read(tmp_path, TEXT, noise=noise)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -72,10 +65,3 @@ def test_a_table_in_memory_keeps_the_same_rules(change: dict[str, Any], message:
         small_table(**change)
     source = r"'a\nb'" if "source" in change else "table in memory"
     assert str(caught.value).startswith(source + message)
-
-
-def test_columns_of_a_table_in_memory_have_one_length():
-    here = Source("here")
-    column_of("offset_nm", np.zeros(2), 2, here)
-    with pytest.raises(TableError, match=r"here, column offset_nm: has the shape \(3,\); every column is a list of"):
-        column_of("offset_nm", np.zeros(3), 2, here)

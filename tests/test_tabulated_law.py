@@ -1,4 +1,4 @@
-"""A law as a table: the same impacts, orbits and motions as the formula it was made of; what is no table."""
+"""A law as a table: the same impacts, orbits and motions as the formula it was made of."""
 
 import jax
 import jax.numpy as jnp
@@ -110,39 +110,11 @@ def test_rows_that_are_captured_bound_the_capture_speed_and_without_adhesion_the
     assert float(law.rebound_speed(0.01)) == pytest.approx(0.008, rel=1e-12)
 
 
-FOUR, SLOWER = [10.0, 20.0, 30.0, 40.0], [9.0, 19.0, 29.0, 39.0]
-
-
-# what a file can hold, too, is refused by lines of the corpus (`tests.malformed`)
-@pytest.mark.parametrize(
-    ("u", "w", "options", "said"),
-    [
-        ([-1.0, *FOUR[1:]], SLOWER, {}, "must be positive, but is -1 in row 1"),
-        (FOUR, [9.0, 0.0, 29.0, 39.0], {}, r"is 0 \(captured\) in row 2, but slower tips leave"),
-        (FOUR, SLOWER, {"capture_speed_nm_per_us": 11.0}, "below the slowest tip that leaves, 10 nm/us, but is 11"),
-        (FOUR, SLOWER, {"delay": DELAY}, "needs the column `collision_delay_us`"),
-        (FOUR, SLOWER, {"mass_ng": -1.0}, "`mass_ng` must be positive"),
-    ],
-)
-def test_what_is_no_table(u, w, options, said):
-    with pytest.raises(ValueError, match=said) as error:
-        TabulatedLaw(u, w, **options)
-    assert "\n" not in str(error.value)
-
-
 @pytest.fixture(scope="module")
 def scenes() -> tuple[Scene, Scene]:
     """The same scene with a formula and with its table."""
     parts = Cantilever(90.0, 40.0), Platform(4.0, 181.8, -1.0)
     return Scene(*parts, WET), Scene(*parts, table_of(WET))
-
-
-@pytest.mark.slow
-def test_map_and_jacobian_are_those_of_the_formula(scenes):
-    for function in (afm.next_impact, afm.map_jacobian):
-        found = (jax.tree.leaves(function(scene, 4.0, 60.0)) for scene in scenes)
-        for ours, theirs in zip(*found, strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-7)
 
 
 @pytest.mark.slow

@@ -11,18 +11,13 @@ from click.testing import CliRunner
 
 import fitting
 from afm_jax.cli.main import main
-from fitting.examples import make_raw_curve
-from fitting.instruments.curve import read_curve, table_text
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import parse_table
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import (
     Lever,
-    Smoother,
     energies,
     largest_energies,
-    matern,
     positive_bands,
     said_of,
 )
@@ -101,27 +96,6 @@ def test_the_air_takes_the_harmonics_of_a_brief_impact():
     np.testing.assert_allclose(
         found.harmonics_aj, np.pi * K / Q * np.sum(n[:, None] ** 2 * squares, axis=0), rtol=1e-12
     )
-
-
-def test_a_smoother_is_the_mean_of_a_constant_and_a_process():
-    rng = np.random.default_rng(3)
-    place, noise, values = np.sort(rng.uniform(-3.0, 0.0, 23)), rng.uniform(0.5, 2.0, 23), rng.normal(2.0, 1.0, 23)
-    smoother, at = Smoother.of(place, noise, 2.0, most=7), np.linspace(-3.5, 0.5, 9)
-    weights = noise**-2.0 * (np.arange(23) * 7 // 23 == np.arange(7)[:, None])
-    average = weights @ values / weights.sum(axis=1)
-    np.testing.assert_allclose(smoother.average(values), average, rtol=1e-12)
-    # a constant that is known to a thousand: textbook regression with one covariance
-    wide = 1e3**2
-    covariance = matern(smoother.place, smoother.place, 2.0) + wide + np.diag(1.0 / weights.sum(axis=1))
-    cross = matern(at, smoother.place, 2.0) + wide
-    weights, variance = smoother.at(at)
-    np.testing.assert_allclose(weights @ average, cross @ np.linalg.solve(covariance, average), rtol=1e-4)
-    left = wide + 2.0**2 - np.sum(cross * np.linalg.solve(covariance, cross.T).T, axis=1)
-    np.testing.assert_allclose(variance, left, rtol=1e-4)
-    # how much the rows move their own means, together
-    means, taken = smoother.of_rows(place, values)
-    moved = [smoother.of_rows(place, values + np.eye(23)[i])[0][i] for i in range(23)]
-    assert taken == pytest.approx(np.sum(moved - means), rel=1e-9)
 
 
 def test_bands_are_those_of_all_instruments_that_leave_energies_above_nothing():
@@ -231,55 +205,6 @@ def test_thresholds_are_found_to_a_tenth_of_a_nanometre(width: float):
         for end, wanted in ((found[change].approach, -1.03), (found[change].retract, -1.03 - width)):
             assert end is not None
             assert end.offset_nm == pytest.approx(wanted, abs=0.1)
-
-
-def test_a_way_that_taps_to_its_farthest_row_has_no_free_rows():
-    offset = np.tile([-44.0, -42.0, -38.0, -34.0], 2)
-    retract = np.repeat([False, True], 4)
-    # the retracting tip passes the free one's amplitude at its second row, on the repulsive branch
-    read = {"amplitude_nm": np.array([40.1, 39.9, 36.0, 33.0, 42.5, 40.05, 37.0, 33.0])}
-    read |= {"lag_deg": np.array([177.0, 176.9, 3.1, 3.0, 3.4, 3.4, 3.2, 3.0]), "drive_frequency_khz": 94.5}
-    assert free_rows(curve_of_rows(8, offset_nm=offset, retract=retract, **read)).tolist() == [True] * 2 + [False] * 6
-    # of one motion, both ways have theirs
-    read["lag_deg"] = np.where(np.arange(8) == 5, 177.1, read["lag_deg"])
-    free = free_rows(curve_of_rows(8, offset_nm=offset, retract=retract, **read))
-    assert free.tolist() == [True] * 2 + [False] * 3 + [True] + [False] * 2
-
-
-def test_a_stated_zero_counts_where_fewer_than_three_rows_are_free():
-    truth = curve_of_energy(TIP, np.linspace(0.9, 0.15, 16), np.full(16, 3.0), np.ones(16, bool))
-    # free rows would know it better, by frequency and Q
-    errors = {"free_frequency_error_khz": 0.01, "calibration": {"phase_zero_deg": (0.0, 10.0)}}
-    for count, wanted in ((2, 10.0), (5, np.inf)):
-        stated = Stated(1e-12, 1e-12, 1e-12, 0.003, 0.2)
-        table = table_of(TIP, truth, stated, np.random.default_rng(1), free_rows=count, **errors)
-        functions = tapping(table, law=False).functions
-        assert functions is not None
-        (zero,) = (one for one in functions.nuisances if one.kind == "phase_zero_deg")
-        assert zero.given.error == wanted
-
-
-def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and_q():
-    table = parse_table(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "example")
-    assert "phase_zero_deg" in table.calibration
-
-    def instrument(**changed: tuple[float, float]):
-        functions = tapping(replace(table, calibration=table.calibration | changed), law=False).functions
-        assert functions is not None
-        return {one.kind: one for one in functions.nuisances}
-
-    found = instrument()
-    frequency = found["free_frequency_khz"]
-    assert frequency.standard_error == instrument(phase_zero_deg=(0.0, 1e3))["free_frequency_khz"].standard_error
-    # stated worse later on, the frequency is not known by the zero that was made with it
-    vague = tapping(replace(table, free_frequency_error_khz=0.1), law=False).functions
-    assert vague is not None
-    assert vague.nuisances[0].standard_error == pytest.approx(0.1, rel=1e-3)
-    # the example's own frequency, which is not the one that is stated
-    assert abs(frequency.value - make_raw_curve.FREE_FREQUENCY_KHZ) < frequency.standard_error
-    # a zero that is known better is used
-    sharp = instrument(phase_zero_deg=(found["phase_zero_deg"].value, 0.1))["free_frequency_khz"]
-    assert sharp.standard_error < 2e-3
 
 
 def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():

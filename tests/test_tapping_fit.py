@@ -92,16 +92,6 @@ def test_a_sticky_contact_on_which_the_lever_pulls_hard_is_fitted_as_wanted():
     judge_fits_of(truth, as_measured(exact))
 
 
-@pytest.mark.slow
-def test_a_soft_contact_is_predicted_as_wanted_above_resonance():
-    """The softest of those of `make tapping`: its surface is 0.6 nm above gap 0, as its delays say."""
-    truth = tapping_truth(2)
-    found = forward(truth, exact_table(truth, 1.1, TABLES, FEW_SHARES)).fast(pull_to=np.inf)
-    assert len(found.nm) == 16
-    assert judge_forward("soft", found) == 0
-    assert max(found.nm.max(), found.degrees.max()) < 0.02
-
-
 def law_at(result: FitResult, speeds: np.ndarray) -> list[np.ndarray]:
     """Return rebound speeds of a fitted law and the ends of its band."""
     law = result.law
@@ -143,49 +133,3 @@ def test_a_contact_is_not_fitted_on_resonance(ratio: float):
     there = dataclasses.replace(table, drive_frequency_khz=ratio * np.asarray(table.drive_frequency_khz))
     with pytest.raises(TableError, match=rf"driven at {ratio:.3f} of the free frequency.*`afm-jax tapping CURVE`"):
         fit(there, "contact")
-
-
-def with_free_ends(table: AmplitudeTable) -> AmplitudeTable:
-    """Return a table with three rows of the free tip before the others, three after, in order of time."""
-    lag = np.rad2deg(np.angle(1.0 - RATIO**2 + 1j * RATIO / (table.quality_factor or np.inf)))
-    ends = {
-        "drive_frequency_khz": (90.0 * RATIO, 90.0 * RATIO),
-        "free_amplitude_nm": (80.0, 40.0),
-        "offset_nm": (-110.0, -70.0),
-        "lockin_amplitude_nm": (80.0, 40.0),
-        "lockin_amplitude_error_nm": (0.24, 0.12),
-        "phase_lag_deg": (lag, lag),
-        "phase_lag_error_deg": (0.2, 0.2),
-    }
-    columns = {
-        name: np.concatenate([np.full(3, first), np.asarray(getattr(table, name)), np.full(3, last)])
-        for name, (first, last) in ends.items()
-    }
-    return dataclasses.replace(table, **columns, order=np.zeros(0, dtype=int), rows_in_order_of_time=True)
-
-
-@pytest.mark.slow
-def test_drifts_along_the_rows_are_told_by_free_rows():
-    degrees, share = 5.0, 0.03
-    truth = tapping_truth(0)
-    steady = with_free_ends(as_measured(exact_table(truth, RATIO, TABLES)))
-    # the phase drifts, and the free amplitude away from what the table says of it
-    course = np.linspace(0.0, 1.0, steady.rows)
-    noise = np.random.default_rng(1).normal(size=(3, steady.rows))
-    read = {name: np.asarray(getattr(steady, name)) for name in steady.form.names if getattr(steady, name) is not None}
-    drifted = dataclasses.replace(
-        steady,
-        phase_lag_deg=read["phase_lag_deg"] + degrees * course + read["phase_lag_error_deg"] * noise[0],
-        lockin_amplitude_nm=read["lockin_amplitude_nm"] + read["lockin_amplitude_error_nm"] * noise[1],
-        free_amplitude_nm=read["free_amplitude_nm"] / (1.0 + share * course),
-    )
-    result = fit(drifted, "viscous+delay")
-    assert result.valid, result.reasons
-    for name, drift, error in (("phase_drift_deg", degrees, 0.3), ("free_amplitude_drift", share, 0.005)):
-        found = result.parameters[name]
-        assert found.standard_error is not None
-        assert abs(found.value - drift) < 2.5 * found.standard_error < 2.5 * error
-    speeds = speeds_covered(truth, result)
-    law, low, high = law_at(result, speeds)
-    assert np.all(np.abs(law - truth.rebound(speeds)) < 2.5 / 1.96 * 0.5 * (high - low))
-    np.testing.assert_allclose(law, truth.rebound(speeds), rtol=0.02)

@@ -1,7 +1,5 @@
 """Maps: energies against the formula of a force on the tip, every format against its writer, masks counted."""
 
-import struct
-import time
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,10 +18,7 @@ from fitting.examples.make_raw_curve import (
     true_energy_aj,
     true_lag_deg,
 )
-from fitting.instruments import images as images_module
-from fitting.instruments import recording as recording_module
 from fitting.instruments.images import read_images
-from fitting.instruments.recording import refuse_other_modes
 from fitting.tapping_curves.curve import Instrument
 from fitting.tapping_curves.energy import energies
 from tests.instrument_files import igor_wave
@@ -109,18 +104,8 @@ def test_pixels_out_of_range_are_masked_and_counted():
     assert any(doubt in reason for reason in wrong.reasons)
 
 
-def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stiffness_energies_are_over_it():
+def test_without_a_stiffness_energies_are_over_it():
     amplitude, lag, energy = image()
-    straight = tapping_map((amplitude, lag), **LEVER)
-    turned = tapping_map((amplitude, -lag), **{**LEVER, "free_phase_deg": (-FREE_LAG, 0.2)})
-    np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
-    np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
-    # on resonance only the sign of the virial hangs on the sense
-    for one, word in ((straight, "lags"), (turned, "leads")):
-        assert any(f"the phase {word}, which is assumed" in note for note in one.notes)
-    stated = tapping_map((amplitude, -lag), phase_sense="lead", **{**LEVER, "free_phase_deg": -FREE_LAG})
-    np.testing.assert_allclose(stated.energy, energy, rtol=2e-4)
-    assert not any("Sign" in note for note in stated.notes)
     found = tapping_map((amplitude, lag), **{k: v for k, v in LEVER.items() if k != "spring_constant_n_per_m"})
     assert found.unit == "nm^2"
     np.testing.assert_allclose(found.energy, energy / SPRING_CONSTANT, rtol=2e-4)
@@ -213,52 +198,23 @@ def test_an_energy_below_zero_or_within_its_errors_is_not_valid():
     assert "most of its error comes from noise of a pixel" in noisy.reasons[0]
 
 
-def test_images_of_other_modes_are_refused_by_name(tmp_path: Path):
-    for name, value, refused in (
-        ("ImagingMode", "PFM Mode", True),
-        ("ImagingMode", "Contact", True),
+@pytest.mark.parametrize(
+    ("name", "value", "refused"),
+    [
         ("ImagingMode", "SS-PFM something new", True),
         ("ImagingMode", "AC Mode", False),
         ("DualACMode", "1", True),
         ("DualACMode", "0", False),
-        ("Op. mode", "Lateral Force", True),
-        ("Op. mode", "Dynamic Force", False),
         ("AFM mode", "PeakForce Tapping", True),
-        ("AFM mode", "Tapping", False),
         ("Control::Imaging mode", "non-contact", False),
-        ("Feedback Mode", "ac-ultra-speed-direct-drive", False),
-        ("Feedback mode", "Free", False),
-    ):
-        said = ""
-        try:
-            refuse_other_modes({name: value}, "image")
-        except TableError as error:
-            said = str(error)
-        assert (f"the mode {value!r} ({name})" in said) == refused, name
+    ],
+)
+def test_images_of_other_modes_are_refused_by_name(tmp_path: Path, name: str, value: str, *, refused: bool):
     amplitude, lag, _ = image()
-    note = "ImagingMode: PFM Mode\rFreeAirAmplitude: NaN\r"
-    (tmp_path / "pfm.ibw").write_bytes(igor_image(amplitude, lag, note))
-    result = run(tmp_path / "pfm.ibw", *CALL, "13.4")
-    assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
-    assert "was recorded in the mode 'PFM Mode' (ImagingMode)" in result.stderr
-
-
-def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
-    """Return a NanoSurf file of two images, amplitude in m and phase in degrees, as 32-bit integers of their range."""
-    header, data = ["[DataSet]", "Version=2", "GroupCount=1", "Gr0-Name=Scan", "Gr0-ID=1", "Gr0-Count=2"], b""
-    header += ["Gr0-Ch0=DataSet-0:0", "Gr0-Ch1=DataSet-0:1"]
-    size = ["Version=2", "SaveMode=Binary", "SaveBits=32", "SaveSign=Signed", "SaveOrder=Intel"]
-    size += ["Frame=Scan forward", "Dim0Name=X*", "Dim0Unit=m", "Dim1Name=Y*", "Dim1Unit=m", "Dim1Min=0"]
-    size += ["Dim0Min=0", "Dim0Range=2e-6", "Dim1Range=1e-6"]
-    for number, (name, unit, values) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "°", phase))):
-        low, width = float(values.min()), float(np.ptp(values))
-        rows, columns = values.shape
-        header += [f"[DataSet-0:{number}]", f"Points={columns}", f"Lines={rows}", *size]
-        header += [f"Dim2Name={name}", f"Dim2Unit={unit}", f"Dim2Min={low!r}", f"Dim2Range={width!r}"]
-        counts = np.round((values - low) / width * (2.0**32 - 1.0) - 2.0**31).astype("<i4")
-        # the first line stands below
-        data += counts[::-1].tobytes()
-    return "\r\n".join(header).encode("latin-1") + b"\r\n\r\n#!" + data
+    (tmp_path / "image.ibw").write_bytes(igor_image(amplitude, lag, f"{name}: {value}\rFreeAirAmplitude: NaN\r"))
+    result = run(tmp_path / "image.ibw", *CALL, "13.4")
+    assert result.exit_code == (2 if refused else 0)
+    assert (f"was recorded in the mode '{value}' ({name})" in result.stderr) is refused
 
 
 def gwyddion_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
@@ -287,63 +243,19 @@ def written(folder: Path, kind: str) -> Path:
     elif kind == "npy":
         np.save(path, np.stack([amplitude, lag]))
     else:
-        path.write_bytes({"ibw": igor_image, "gwy": gwyddion_image, "nid": nanosurf_image}[kind](amplitude, lag))
+        path.write_bytes({"ibw": igor_image, "gwy": gwyddion_image}[kind](amplitude, lag))
     return path
 
 
-@pytest.mark.parametrize("kind", ["npz", "npy", "ibw", "gwy", "nid"])
+@pytest.mark.parametrize("kind", ["npz", "npy", "ibw", "gwy"])
 def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
-    if kind in {"gwy", "nid"}:
+    if kind == "gwy":
         pytest.importorskip("gwyddionpy")
     amplitude, lag, _ = image()
     found = read_images(written(tmp_path, kind))
     np.testing.assert_allclose(found.amplitude, amplitude, rtol=3e-7)
     np.testing.assert_allclose(found.phase_deg, lag, rtol=3e-7)
-    assert found.size_m == ((1e-6, 2e-6) if kind in {"ibw", "gwy", "nid"} else None)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_measured_image_by_gwyddion_is_what_the_vendors_package_reads():
-    package = pytest.importorskip("NSFopen.read")
-    pytest.importorskip("gwyddionpy")
-    examples = Path(pytest.importorskip("NSFopen").__file__).parent / "example"
-    image, friction = examples / "Plotting_Data" / "MoS2.nid", examples / "Lateral_Force" / "SBS-PMMA.nid"
-    if not (image.exists() and friction.exists()):
-        pytest.skip("this release of NSFopen comes without its examples")
-    theirs = package.read(str(image)).data["Image"]["Forward"]
-    found = read_images(image)
-    # Gwyddion counts rows from above
-    for ours, name in ((found.amplitude, "Amplitude"), (found.phase_deg, "Phase")):
-        wanted = np.asarray(theirs[name])
-        assert any(np.allclose(ours, rows, rtol=1e-6, atol=1e-9) for rows in (wanted, wanted[::-1]))
-    assert found.in_volts
-    assert found.known["drive_frequency_khz"].value == 172.823
-    with pytest.raises(TableError, match=r"the mode 'Lateral Force' \(Op\. mode\)"):
-        read_images(friction)
-
-
-def test_gwyddions_program_is_limited_and_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    pytest.importorskip("gwyddionpy")
-    path = written(tmp_path, "nid")
-    strange = tmp_path / "-strange.xyz"
-    strange.write_bytes(b"\xff\xfe nothing that anybody knows")
-    for name, value, file, said in (
-        ("_PATIENCE_S", 60.0, strange, "gwyddionpy does not read it (cannot load"),
-        ("_PATIENCE_S", 1e-3, path, "did not finish within 0.001 s"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(images_module, name, value)
-            with pytest.raises(TableError) as raised:
-                read_images(file)
-        assert said in str(raised.value)
-        assert "\n" not in str(raised.value)
-
-    def missing(name: str):
-        raise ModuleNotFoundError(name=name)
-
-    monkeypatch.setattr(recording_module, "import_module", missing)
-    with pytest.raises(TableError, match=r"package gwyddionpy; install it with: pip install 'afm-jax\[gwyddion\]'"):
-        read_images(path)
+    assert found.size_m == ((1e-6, 2e-6) if kind in {"ibw", "gwy"} else None)
 
 
 def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
@@ -395,41 +307,17 @@ def test_images_of_one_number_or_of_none(tmp_path: Path):
 
 def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path):
     amplitude, lag, _ = image()
+    stored = written(tmp_path, "npz")
     np.savez(tmp_path / "one.npz", amplitude=amplitude)
     np.savez(tmp_path / "sizes.npz", amplitude=amplitude, phase=lag[:-1])
     np.savez(tmp_path / "volts.npz", amplitude_v=amplitude, phase_deg=lag)
-    (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
-    stored, _ = written(tmp_path, "npz"), written(tmp_path, "gwy")
-    for name, said in (
-        ("one.npz", "no phase_lag_deg among the channels amplitude; say --columns"),
-        ("sizes.npz", "must be rows of one size"),
-        ("volts.npz", "give --nm-per-volt NM"),
-        ("cut.gwy", "gwyddionpy does not read it"),
-    ):
-        result = run(tmp_path / name, *CALL, "13.4")
-        assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), name
-        assert said in result.stderr
     for call, said in (
-        (
-            ["tapping-map", stored],
-            "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM --free-phase-deg DEGREES",
-        ),
-        (["read", tmp_path / "image.gwy"], "energies of images: afm-jax tapping-map"),
+        (["tapping-map", tmp_path / "one.npz", *CALL, "13.4"], "no phase_lag_deg among the channels amplitude"),
+        (["tapping-map", tmp_path / "sizes.npz", *CALL, "13.4"], "must be rows of one size"),
+        (["tapping-map", tmp_path / "volts.npz", *CALL, "13.4"], "give --nm-per-volt NM"),
+        (["tapping-map", stored], "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM"),
         (["tapping", stored], "energies of images: afm-jax tapping-map"),
     ):
         result = CliRunner().invoke(main, [str(word) for word in call])
-        assert result.exit_code == 2
+        assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), call
         assert said in result.stderr
-    with pytest.raises(
-        TableError, match="the amplitude has 12 x 20 pixels, the phase 20; they must be rows of one size"
-    ):
-        tapping_map((amplitude, lag[0]), **LEVER)
-
-
-@pytest.mark.slow
-def test_a_million_pixels_take_less_than_two_seconds():
-    amplitude, lag, _ = image(1024, 1024)
-    begun = time.process_time()
-    found = tapping_map((amplitude, lag), **LEVER)
-    assert time.process_time() - begun < 2.0
-    assert found.counts["used"] == 1024**2

@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import mpmath
 import numpy as np
@@ -11,7 +10,7 @@ from click.testing import CliRunner
 from scipy.stats import gamma
 
 from afm_jax.cli.main import main
-from fitting import TableError, calibrate, read_resonance, sader
+from fitting import calibrate, sader
 from fitting.calibration.model import deviance_root
 from fitting.calibration.stiffness import BOLTZMANN, air_at, hydrodynamic_function
 from fitting.calibration.sweep import DENSITY, Resonance
@@ -36,11 +35,10 @@ def density(khz: np.ndarray, floor: float = 2e-8, quality: float = QUALITY_FACTO
     return 2.0 * variance / (np.pi * quality * natural) * shape + floor
 
 
-def thermal_spectrum(averages: float, random: np.random.Generator, *, points: int = 128, known: bool = True):
-    khz = np.linspace(86.0, 94.0, points)
-    drawn = density(khz) * random.gamma(averages, 1.0 / averages, points)
-    count = averages if known else None
-    return Resonance(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=count)
+def thermal_spectrum(averages: float, random: np.random.Generator) -> Resonance:
+    khz = np.linspace(86.0, 94.0, 128)
+    drawn = density(khz) * random.gamma(averages, 1.0 / averages, 128)
+    return Resonance(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=averages)
 
 
 def run(*arguments: object):
@@ -89,20 +87,6 @@ def test_saders_stiffness_is_what_nanosurf_states_in_the_file():
     assert sader(179.8, 442.0, 225.0, 41.0) / stated - 1.0 == pytest.approx(0.0375, rel=0.4)
 
 
-def test_spectra_are_read_from_csv(tmp_path):
-    khz = np.linspace(80.0, 100.0, 30)
-    path, head = tmp_path / "spectrum.csv", "frequency_hz,psd_nm2_per_hz"
-    np.savetxt(path, np.stack([1e3 * khz, density(khz)], 1), "%.17g", ",", header=head, comments="")
-    sweep = read_resonance(path)
-    assert (sweep.averages, sweep.spectrum) == (None, True)
-    assert read_resonance(THERMAL).averages is not None
-    np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
-    cut = tmp_path / "cut.nid"
-    cut.write_bytes(THERMAL.read_bytes()[:-8])
-    with pytest.raises(TableError, match="announces 66952 bytes"):
-        read_resonance(cut)
-
-
 @pytest.mark.parametrize(("quality", "points"), [(60, 128), (150, 400), (1000, 400)])
 def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
     khz = np.linspace(86.0, 94.0, points)
@@ -137,25 +121,6 @@ def test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved(tmp_path: 
     assert any("Q is hardly resolved" in warning for warning in told["warnings"])
 
 
-def test_options_count_and_comments_that_would_are_refused(tmp_path: Path):
-    khz = np.linspace(80.0, 100.0, 400)
-    drawn = density(khz) * np.random.default_rng(5).gamma(200.0, 0.005, khz.size)
-    path = written(tmp_path / "one.csv", khz, drawn)
-
-    def k(*options: str, how: str = "equipartition") -> float:
-        answer: dict[str, Any] = strictly(run(path, "--json", "--averages", "200", *options).stdout)
-        return answer["spring_constant_n_per_m"][how]["value"]
-
-    # in proportion to T, 296 K without it
-    assert k("--temperature-k", "310") / k() == pytest.approx(310.0 / 296.0, rel=1e-12)
-    assert k("--length-um", "225 +- 2", "--width-um", "40 +- 1", how="sader") > 0.0
-    # what would change the result is never left among the remarks
-    for key in ("averages", "temperature_k", "quality_factor", "spring_constant_n_per_m", "mass_ng"):
-        refused = run(written(tmp_path / "two.csv", khz, drawn, "measured in air", f"{key} = 3"))
-        assert refused.exit_code == 2
-        assert f"line 2: {key} sets nothing in such a file" in refused.stderr
-
-
 def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
     result = run(THERMAL, "--json", "--length-um", "225 +- 2", "--width-um", "40 +- 1")
     assert result.exit_code == 0, result.stderr
@@ -182,32 +147,27 @@ def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
     assert (told["valid"], lone["standard_error"], lone["interval95"]) == (False, None, [None, None])
     assert told["quality_factor"]["standard_error"] > 0.0
     assert told["table_comments"] == []
-    result = calibrate(THERMAL, length_um="225 +- 2", width_um="40 +- 1").spring_constant_n_per_m
-    assert result["sader"].value == stiffness["sader"]["value"]
-    with pytest.raises(ValueError, match=r"`wide` is neither a number .*; write `width_um=40`"):
-        calibrate(THERMAL, length_um="225", width_um="wide")
     half = run(THERMAL, "--length-um", "225")
     assert half.exit_code == 2
     assert "needs both --length-um and --width-um" in half.stderr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", [True, False])
-def test_intervals_hold_the_truth_as_often_as_they_say(known):
-    random, draws = np.random.default_rng(11), 200 if known else 80
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    random, draws = np.random.default_rng(11), 200
     # the whole of kT here: the oscillator is a point, not a lever's first mode
     wanted = np.array([FREQUENCY_KHZ, QUALITY_FACTOR, 0.971 * STIFFNESS_N_PER_M])
     held, apart = np.zeros(3), []
     for _ in range(draws):
-        spectrum = thermal_spectrum(100.0, random, known=known)
-        result = calibrate(spectrum, temperature_k=(WARM_K, None), static=False, scale_error=1e-9)
+        result = calibrate(
+            thermal_spectrum(100.0, random), temperature_k=(WARM_K, None), static=False, scale_error=1e-9
+        )
         found = (result.frequency_khz, result.quality_factor, result.spring_constant_n_per_m["equipartition"])
         low, high = np.array([one.interval95 for one in found], dtype=float).T
         held += (low < wanted) & (wanted < high)
         apart.append(np.array([one.value for one in found]) / wanted - 1.0)
     # 95 % of 200 is known to 1.5 %
-    low, high = (0.92, 0.985) if known else (0.88, 1.0)
-    assert np.all((held / draws >= low) & (held / draws <= high)), held / draws
+    assert np.all((held / draws >= 0.92) & (held / draws <= 0.985)), held / draws
     # of the deflection's scale 5 % are assumed, which k has twice
     assumed = calibrate(thermal_spectrum(100.0, random), temperature_k=(WARM_K, None))
     assumed = assumed.spring_constant_n_per_m["equipartition"]

@@ -40,15 +40,6 @@ def test_every_dependency_has_one_lower_bound(tmp_path):
             lower_bounds(project)
 
 
-def test_what_pip_installs_without_extras_is_what_was_agreed():
-    # a package more is a decision: an extra, if only some need it
-    names = {re.split(r"\W", line.replace("-", "_"))[0] for line in LISTED["dependencies"]}
-    assert names == {
-        *("jax", "diffrax", "equinox", "flatbuffers", "optax", "optimistix", "jaxtyping", "numpy", "scipy"),
-        *("matplotlib", "click", "jinja2", "rich", "tomli_w"),
-    }
-
-
 @pytest.fixture
 def consulted(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Run the doctor, in the text form or another, without its programs: a call takes a moment."""
