@@ -669,9 +669,8 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
     if missing:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
-    u, w, late = (_told(name, told.get(name, ())) for name in names)
-    columns, numbers = (u, w, late if late.size else None), told.get("numbers")
-    mass, origin = told.get("mass_ng"), str(told.get("origin", ""))
+    columns = [_told(name, told[name], (len(told[name]),)) for name in names if name in told]
+    numbers, mass, origin = told.get("numbers"), told.get("mass_ng"), str(told.get("origin", ""))
     if not isinstance(numbers, Mapping):
         capture = told.get("capture_speed_nm_per_us")
         return TabulatedLaw(*columns, capture_speed_nm_per_us=capture, mass_ng=mass, origin=origin)
@@ -703,18 +702,16 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     )
 
 
-def _told(name: str, number: Any, shape: tuple[int, ...] | None = None) -> Any:
+def _told(name: str, number: Any, shape: tuple[int, ...]) -> Any:
     """Return a number of a law that a file tells, or an array of them.
 
     Raises:
-        ValueError: if it is no number, not of that shape, or not finite; None: a column, which is checked elsewhere.
+        ValueError: if it is no number, not of that shape, or not finite.
     """
     try:
         found = np.asarray(number, float)
     except (OverflowError, TypeError, ValueError) as error:
         raise ValueError(f"`{name}` of the law must be numbers") from error
-    if shape is None:
-        return found
     if found.shape != shape or not np.isfinite(found).all():
         many = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
         raise ValueError(f"`{name}` of the law must be {many}")
@@ -785,7 +782,7 @@ class Origin:
         return hash(Origin)
 
 
-def _columns_of_law(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, Any, int]:
+def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any, Any, Any, int]:
     """Return a table's columns, checked as far as their numbers are known, and how many rows are captured.
 
     The columns are approach and rebound speed in nm/us and the delay in us; the captured rows are the slowest.
