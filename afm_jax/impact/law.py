@@ -463,34 +463,30 @@ class TabulatedLaw(Law):
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
         u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
         u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
-        numpy = _numpy_of(u, w, late, rebound_changes, delay_changes, capture_changes, law.capture, law.delay)
-        by_rebound = numpy.asarray(rebound_changes, float)
+        by_rebound = np.asarray(rebound_changes, float)
         if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        by_rebound, nothing = by_rebound[:, captured:], numpy.zeros((by_rebound.shape[0], 1))
-        by_delay = nothing if delay_changes is None else numpy.asarray(delay_changes, float)[:, captured:]
-        by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
+        by_rebound, nothing = by_rebound[:, captured:], np.zeros((by_rebound.shape[0], 1))
+        by_delay = nothing if delay_changes is None else np.asarray(delay_changes, float)[:, captured:]
+        by_capture = nothing[:, 0] if capture_changes is None else np.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
-        capture = numpy.asarray(law.capture)
+        capture = np.asarray(law.capture)
 
         def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
             # no rebound, and no distance from capture, changes by more than 1 %
-            relative = numpy.abs(numpy.append(by_rebound, by_capture)) / numpy.append(w, u[0] - capture)
-            small, ends = _SMALL / numpy.maximum(1.0, 100.0 * _SMALL * numpy.max(relative)), []
+            relative = np.abs(np.append(by_rebound, by_capture)) / np.append(w, u[0] - capture)
+            small, ends = _SMALL / np.maximum(1.0, 100.0 * _SMALL * np.max(relative)), []
             for side in (-small, small):
                 rebound, held = w + side * by_rebound, capture + side * by_capture
                 if extrapolated:
-                    held = _capture_speed(u, rebound, 0.0, numpy)
+                    held = _capture_speed(u, rebound, 0.0, np)
                 delayed = None if late is None else late + side * by_delay
                 # the formula beside the table and the splines' knots stay as they are
-                ends.append((held, *_splines(u, rebound, delayed, held, law, numpy)))
+                ends.append((held, *_splines(u, rebound, delayed, held, law, np)))
             names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
             return {name: (end - start) / (2.0 * small) for name, start, end in zip(names, *ends, strict=False)}
 
-        changes = by_rebound, by_delay, by_capture
-        if numpy is jnp:
-            return _replaced(law, deviations=jax.vmap(along)(*changes))
-        each = [along(*change) for change in zip(*changes, strict=True)]
+        each = [along(*change) for change in zip(by_rebound, by_delay, by_capture, strict=True)]
         deviations = {name: jnp.asarray([one[name] for one in each]) for name in each[0]}
         return _replaced(law, deviations=deviations)
 
