@@ -304,7 +304,7 @@ def _drive_frequency(driven: Driven) -> Float[Array, "..."]:
     """Return the sum of the angular frequencies of cantilever and surface in rad/us; 0 for a free tip."""
     if driven.drive is None:
         return jnp.zeros_like(driven.inverse_mass)
-    return driven.cantilever.angular_frequency + driven.surface.fastest_angular_frequency
+    return driven.drive.cantilever.angular_frequency + driven.drive.surface.fastest_angular_frequency
 
 
 def eighth_order_step(
