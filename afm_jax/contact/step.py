@@ -31,8 +31,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import ContactState, Driven
-from afm_jax.contact.forces.force import slope_of
 from afm_jax.contact.junction import ContactPhase
+from afm_jax.solve.derivatives import slope_of
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
-from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.derivatives import implicit_root, slope_of
 from afm_jax.strict_json import plain
 
 BRIDGE_NM = 4.7
@@ -211,13 +211,11 @@ class Law(Impact):
 
     def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d u_out/d u_in, a number; 0 where the tip is captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.rebound_speed, (u,), (jnp.ones_like(u),))[1]
+        return slope_of(self.rebound_speed, as_argument(approach_speed))
 
     def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.collision_delay, (u,), (jnp.ones_like(u),))[1]
+        return slope_of(self.collision_delay, as_argument(approach_speed))
 
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""

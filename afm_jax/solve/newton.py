@@ -12,13 +12,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.solve.derivatives import implicit_system, solved_columns
+from afm_jax.solve.derivatives import implicit_system, solved_columns, value_and_slopes
 
 
 class Newton(NamedTuple):
@@ -85,13 +84,9 @@ def newton(
     fixed = lax.stop_gradient(parameters)
     begin = lax.stop_gradient(guess)
 
-    def twice(x: Array) -> tuple[Array, Array]:
-        value = residual(x, fixed)
-        return value, value
-
     def improve(state: tuple[Array, Array, Root]) -> tuple[Array, Array, Root]:
         done, going, (x, *before) = state
-        slopes, value = jax.jacfwd(twice, has_aux=True)(x)
+        value, slopes = value_and_slopes(lambda x: residual(x, fixed), x)
         full = -solved_columns(list(slopes.T), value)
         step, sizes = settings.limited(x, full)
         # of two equations the solution is 0 where the matrix is singular
