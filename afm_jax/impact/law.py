@@ -395,8 +395,7 @@ class TabulatedLaw(Law):
     ):
         """Make a law of columns: see the class."""
         u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        held = float(u[captured - 1]) if captured else 0.0
-        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
+        held = max(captured, default=0.0)
         check_parameter("mass_ng", mass_ng, "positive", optional=True)
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
@@ -460,12 +459,11 @@ class TabulatedLaw(Law):
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
         u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
         by_rebound = np.asarray(rebound_changes, float)
-        if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
+        if by_rebound.ndim != 2 or by_rebound.shape[1] != len(captured) + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        by_rebound, nothing = by_rebound[:, captured:], np.zeros((by_rebound.shape[0], 1))
-        by_delay = nothing if delay_changes is None else np.asarray(delay_changes, float)[:, captured:]
+        by_rebound, nothing = by_rebound[:, len(captured) :], np.zeros((by_rebound.shape[0], 1))
+        by_delay = nothing if delay_changes is None else np.asarray(delay_changes, float)[:, len(captured) :]
         by_capture = nothing[:, 0] if capture_changes is None else np.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
         capture = np.asarray(law.capture)
@@ -776,8 +774,8 @@ class Origin:
         return hash(Origin)
 
 
-def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any, Any, Any, int]:
-    """Return a table's columns, checked as far as their numbers are known, and how many rows are captured.
+def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any, Any, Any, list[float]]:
+    """Return the columns of rows that leave, checked as far as their numbers are known, and the speeds captured.
 
     The columns are approach and rebound speed in nm/us and the delay in us; the captured rows are the slowest.
 
@@ -790,7 +788,7 @@ def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any
     if len(u) < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds, but has {len(u)}")
     if is_traced(u):
-        return u, w, late, 0
+        return u, w, late, []
     fall = np.flatnonzero(np.diff(u) <= 0.0)
     if fall.size:
         first, second = u[fall[0]], u[fall[0] + 1]
@@ -803,7 +801,8 @@ def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any
     captured = 0 if is_traced(w) else _captured_rows(u, w)
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
-    return u, w, late, captured
+    late = None if late is None else late[captured:]
+    return u[captured:], w[captured:], late, u[:captured].tolist()
 
 
 def _numpy_of(*values: Any) -> Any:
