@@ -181,7 +181,7 @@ MUTATIONS = {
         "tests/test_dry_contact.py::test_collisions_are_those_of_an_independent_integration[changed0-False]",
     ),
     "delay counted from where the bridge forms, both ways": Mutation(
-        "/ speed + {end.gap_nm => contact.bridge_forms_nm} / jnp.where(leaves", COLLISIONS
+        "/ speed + {ends_nm => contact.bridge_forms_nm} / jnp.where(leaves", COLLISIONS
     ),
     "bridge that breaks where it formed": Mutation(
         "jnp.maximum(self.{breaks_nm => forms_nm}, self.junction", COLLISIONS

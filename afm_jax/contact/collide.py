@@ -176,71 +176,52 @@ def collision(
     retract = retract_through_bridge(tip, solid.energy_aj, setting)
     lacking = jnp.minimum(retract.energy_aj, jnp.minimum(solid.energy_aj, approach.energy_aj))
     sticks = (approach.energy_aj > 0.0) & ~(solid.energy_aj > 0.0)
-    end = _End(
-        energy_aj=jnp.where(lacking > 0.0, retract.energy_aj, lacking),
-        time_us=approach.time_us + solid.time_us + retract.time_us,
-        gap_nm=tip.ends_nm,
-        dissipated_aj=approach.dissipated_aj + retract.dissipated_aj,
-        deepest_gap_nm=solid.deepest_gap_nm,
-        time_in_junction_us=solid.time_us,
-        junction_hysteresis_aj=junction.junction_hysteresis_aj,
-        leaves_as=CollisionOutcome.REBOUND,
-        stays_as=jnp.where(sticks, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE),
-    )
+    # kinetic, signed: positive where the tip leaves
+    end_aj = jnp.where(lacking > 0.0, retract.energy_aj, lacking)
+    lasts_us, in_junction_us = approach.time_us + solid.time_us + retract.time_us, solid.time_us
+    dissipated_aj, junction_aj = approach.dissipated_aj + retract.dissipated_aj, junction.junction_hysteresis_aj
+    ends_nm, deepest_nm, leaves_as = tip.ends_nm, solid.deepest_gap_nm, CollisionOutcome.REBOUND
+    stays_as = jnp.where(sticks, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE)
     settled = jnp.ones_like(valid)
     if setting.careful and contact.spans:
         turn = for_each_lane(turn_in_bridge, tip, speed, approach.dissipated_aj)
         turns, none = turn.turns & (approach.energy_aj <= 0.0), jnp.zeros_like(turn.time_us)
-        how = CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE
+        straight = end_aj, lasts_us, ends_nm, dissipated_aj, deepest_nm, in_junction_us, junction_aj
         turned = turn.energy_aj, turn.time_us, contact.bridge_breaks_nm, turn.dissipated_aj, turn.gap_nm, none, none
-        end = jax.tree.map(lambda a, b: jnp.where(turns, a, b), _End(*turned, *how), end)
+        end_aj, lasts_us, ends_nm, dissipated_aj, deepest_nm, in_junction_us, junction_aj = (
+            jnp.where(turns, here, other) for here, other in zip(turned, straight, strict=True)
+        )
+        leaves_as = jnp.where(turns, CollisionOutcome.TURNED_IN_BRIDGE, leaves_as)
+        stays_as = jnp.where(turns, CollisionOutcome.CAPTURED_BY_BRIDGE, stays_as)
         settled = turn.settled | ~turns
     if setting.careful:
-        settled = settled & jnp.isfinite(end.energy_aj) & jnp.isfinite(end.dissipated_aj)
-    leaves = end.energy_aj > 0.0
-    outcome = jnp.where(leaves, end.leaves_as, end.stays_as)
+        settled = settled & jnp.isfinite(end_aj) & jnp.isfinite(dissipated_aj)
+    leaves = end_aj > 0.0
+    outcome = jnp.where(leaves, leaves_as, stays_as)
     outcome = jnp.where(settled, outcome, CollisionOutcome.UNRESOLVED)
     outcome = jnp.where(junction.exists, outcome, CollisionOutcome.NO_JUNCTION)
     outcome = jnp.where(valid, outcome, CollisionOutcome.INVALID_START).astype(jnp.int32)
-    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, end.energy_aj, 1.0) / mass), 0.0)
-    straight_us = contact.bridge_forms_nm / speed + end.gap_nm / jnp.where(leaves, rebound, 1.0)
+    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, end_aj, 1.0) / mass), 0.0)
+    straight_us = contact.bridge_forms_nm / speed + ends_nm / jnp.where(leaves, rebound, 1.0)
     result = Collision(
         approach_speed_nm_per_us=speed,
         rebound_speed_nm_per_us=rebound,
-        collision_delay_us=jnp.where(leaves, end.time_us - straight_us, 0.0),
+        collision_delay_us=jnp.where(leaves, lasts_us - straight_us, 0.0),
         captured=~leaves,
         outcome=outcome,
-        time_in_contact_us=jnp.where(leaves, end.time_us, 0.0),
-        time_in_junction_us=jnp.where(leaves, end.time_in_junction_us, 0.0),
-        deepest_gap_nm=end.deepest_gap_nm,
+        time_in_contact_us=jnp.where(leaves, lasts_us, 0.0),
+        time_in_junction_us=jnp.where(leaves, in_junction_us, 0.0),
+        deepest_gap_nm=deepest_nm,
         bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
-        junction_hysteresis_aj=end.junction_hysteresis_aj,
-        viscous_loss_aj=end.dissipated_aj,
-        end_energy_aj=end.energy_aj,
+        junction_hysteresis_aj=junction_aj,
+        viscous_loss_aj=dissipated_aj,
+        end_energy_aj=end_aj,
     )
     # what has no result holds zeros
     ends = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
     result = jax.tree.map(lambda part: jnp.where(ends, part, jnp.zeros_like(part)), result)
     resolved = _resolved(tip, start_aj, approach, solid, retract, setting) | ~valid | ~junction.exists
     return result._replace(approach_speed_nm_per_us=approach_speed, outcome=outcome), resolved
-
-
-class _End(NamedTuple):
-    """How a collision ends."""
-
-    energy_aj: Float[Array, "..."]
-    """Kinetic energy, signed: positive where the tip leaves."""
-    time_us: Float[Array, "..."]
-    """From the beginning of the contact to its end."""
-    gap_nm: Float[Array, "..."]
-    """Where contact ends."""
-    dissipated_aj: Float[Array, "..."]
-    deepest_gap_nm: Float[Array, "..."]
-    time_in_junction_us: Float[Array, "..."]
-    junction_hysteresis_aj: Float[Array, "..."]
-    leaves_as: Int[ArrayLike, "..."]
-    """Outcome of a tip that leaves, and of one that stays."""
-    stays_as: Int[ArrayLike, "..."]
 
 
 def _resolved(

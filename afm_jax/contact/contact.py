@@ -22,13 +22,13 @@ from afm_jax.contact.forces.force import (
     Force,
     ForceSum,
     StaticForce,
-    slope_of,
     terms_of,
 )
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
 from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, EFFECTS, PAPER, REQUIRED_EFFECTS
+from afm_jax.solve.derivatives import slope_of
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 

@@ -79,16 +79,8 @@ class Driven(NamedTuple):
         return self.solid.energy_scale_aj * (work(self.solid.fold) - work(self.junction.forms_root))
 
     @property
-    def cantilever(self) -> Cantilever:
-        """The cantilever of a tip that has one."""
-        return self._driven_by().cantilever
-
-    @property
-    def surface(self) -> Platform | Surface:
-        """The surface that a driven tip moves over."""
-        return self._driven_by().surface
-
-    def _driven_by(self) -> Drive:
+    def driving(self) -> Drive:
+        """What acts on a tip that is driven."""
         if self.drive is None:
             raise TypeError("a free tip has neither cantilever nor surface")
         return self.drive

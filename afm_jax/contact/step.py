@@ -31,8 +31,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import ContactState, Driven
-from afm_jax.contact.forces.force import slope_of
 from afm_jax.contact.junction import ContactPhase
+from afm_jax.solve.derivatives import slope_of
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""
@@ -304,7 +304,7 @@ def _drive_frequency(driven: Driven) -> Float[Array, "..."]:
     """Return the sum of the angular frequencies of cantilever and surface in rad/us; 0 for a free tip."""
     if driven.drive is None:
         return jnp.zeros_like(driven.inverse_mass)
-    return driven.cantilever.angular_frequency + driven.surface.fastest_angular_frequency
+    return driven.drive.cantilever.angular_frequency + driven.drive.surface.fastest_angular_frequency
 
 
 def eighth_order_step(

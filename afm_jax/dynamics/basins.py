@@ -10,19 +10,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import columns_of, rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Tips, advance
+from afm_jax.dynamics.many_tips import Tips, recorded
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import LANES, Report, in_blocks
+from afm_jax.solve.lanes import WIDTHS, Report, in_blocks
 from afm_jax.units import within_turn
 
 _LONG = 1000
@@ -284,14 +283,14 @@ class _Finder:
         """Return the attractor of every start, as soon as it has arrived."""
         count = len(tips.time_us)
         label, remaining = np.full(count, -1), np.arange(count)
+        scenes = {width: self.scenes(width) for width in WIDTHS}
         # after so many impacts starts that have arrived drop out
         for impacts in (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512):
 
             def work(some: Tips, impacts: int = impacts) -> Tips:
-                return _later(self.scene, some, impacts=impacts)
+                return recorded(scenes[len(some.time_us)], some, impacts - 1, impacts=1)[0]
 
-            # pieces of usual width, some in a call
-            tips = in_blocks(work, tips, block=8 * LANES)
+            tips = in_blocks(work, tips)
             arrival, kinds = np.full(remaining.size, -1), kinds_of(tips.outcome)
             for number, orbit in enumerate(self.attractors):
                 arrival[self._is_at(orbit, self.omega * tips.time_us, tips.velocity_nm_per_us)] = number
@@ -310,19 +309,6 @@ class _Finder:
         else:
             label[remaining] = self.pointless(int(MotionKind.IRREGULAR))
         return label
-
-
-@jax.jit
-def _later(scene: Scene, tips: Tips, *, impacts: int | Int[Array, ""]) -> Tips:
-    """Return tips some impacts later."""
-
-    def piece(tips: Tips) -> Tips:
-        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tips.time_us.shape, *leaf.shape)), scene)
-        return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now)[0], tips)
-
-    lanes = tips.time_us.shape[0]
-    pieces = jax.tree.map(lambda part: part.reshape(-1, min(LANES, lanes)), tips)
-    return jax.tree.map(lambda part: part.reshape(lanes), lax.map(piece, pieces))
 
 
 def _with_names(attractors: list[Attractor]) -> list[Attractor]:

@@ -159,7 +159,6 @@ class StabilityChart(Result):
     """A chart of stable admissible single-impact orbits over two parameters.
 
     Attributes:
-        scene_of: the scene at the two parameters' values.
         x_values: of the columns, ascending; in the paper's figures n = omega/2 Omega.
         y_values: of the rows, ascending; in the paper's figures beta in nm.
         verdicts: orders 1, 2, ... by points; the points are the rows one after the other.
@@ -168,7 +167,6 @@ class StabilityChart(Result):
         probability: fraction of drawn laws with a stable orbit, of each order and point; None: no laws were drawn.
     """
 
-    scene_of: Callable[..., Scene]
     x_values: Float[np.ndarray, " columns"]
     y_values: Float[np.ndarray, " rows"]
     verdicts: OrbitVerdicts
@@ -323,7 +321,7 @@ def stability_chart(
             raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), range(1, last_order + 1), report=report)
-    return StabilityChart(scene_of, x, y, verdicts)
+    return StabilityChart(x, y, verdicts)
 
 
 def stable_probability(

@@ -86,10 +86,8 @@ def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = 
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
     check_loop(order, impacts)
     family = ContactLoops.of(scene, order, accuracy=accuracy)
-    found, _ = family.found(np.zeros(0), impacts)
-    flown = [loop for loop in family.flown(found, np.zeros((len(found), 0))) if loop is not None]
-    loops = np.array([loop.loop for loop in flown]).reshape(-1, 2 * impacts)
-    return orbits_of(loops, _readings_of(flown, impacts))
+    loops, _ = family.found(np.zeros(0), impacts)
+    return orbits_of(loops, family.readings(loops))
 
 
 class FlownLoop(NamedTuple):
@@ -384,7 +382,10 @@ class ContactLoops(LoopFamily):
         flown = [loop for loop in self.flown(*self.loops_and_values(points)) if loop is not None]
         if len(flown) < len(points):
             raise ValueError("a loop that was closed does not fly")
-        return _readings_of(flown, (points.shape[1] - len(self.paths)) // 2)
+        if not flown:
+            each, whole = jnp.zeros((0, (points.shape[1] - len(self.paths)) // 2)), jnp.zeros(0)
+            return LoopReading(*[*[each] * 6, *[whole] * 3, whole > 0.0, whole])
+        return jax.tree.map(lambda *numbers: np.stack([np.asarray(each) for each in numbers]), *map(_reading_of, flown))
 
     def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `LoopFamily.tests`; that of grazing NaN where it is not asked for."""
@@ -392,14 +393,6 @@ class ContactLoops(LoopFamily):
         near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
         speeds = np.array([near, np.split(flown.loop, 2)[1].min()]) / float(self.speed_unit)
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
-
-
-def _readings_of(flown: Sequence[FlownLoop], impacts: int) -> LoopReading:
-    """Return what there is to know of closed loops of m contacts, NumPy arrays with a leading axis of loops."""
-    if not flown:
-        each, whole = jnp.zeros((0, impacts)), jnp.zeros(0)
-        return LoopReading(*[*[each] * 6, *[whole] * 3, whole > 0.0, whole])
-    return jax.tree.map(lambda *numbers: np.stack([np.asarray(each) for each in numbers]), *map(_reading_of, flown))
 
 
 def _reading_of(flown: FlownLoop) -> LoopReading:

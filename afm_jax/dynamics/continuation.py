@@ -56,7 +56,6 @@ _ENDS = {
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began (it is closed)",
-    "grazing": "where a flight grazes the sample, and another motion follows",
     "lost": "a point that it could not be followed beyond",
     "too long": "the most points that are followed",
 }

@@ -38,7 +38,7 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.arclength import EquationsAt, PointInPlane
-from afm_jax.solve.derivatives import largest
+from afm_jax.solve.derivatives import largest, value_and_slopes
 from afm_jax.solve.lanes import in_blocks
 from afm_jax.solve.newton import Newton, newton
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -146,12 +146,7 @@ class LawLoops(LoopFamily):
 
     @jax.jit
     def _value_and_slopes(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        def twice(point: Array) -> tuple[Array, Array]:
-            value = self.equations(point)
-            return value, value
-
-        slopes, value = jax.jacfwd(twice, has_aux=True)(point)
-        return value, slopes
+        return value_and_slopes(self.equations, point)
 
     def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
         """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""

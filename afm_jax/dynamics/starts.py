@@ -14,7 +14,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene
 from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
-from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, after_impacts
@@ -23,7 +22,7 @@ from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start, gap_of_departure
+from afm_jax.motion.start import default_start, gap_of_departure, rebound_of_leaving
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import in_blocks
 
@@ -133,14 +132,8 @@ def leaving_tips(scenes: Scene) -> Tips:
     Args:
         scenes: a batch of scenes.
     """
-    platform, interaction = scenes.platform, scenes.interaction
-    time = 0.75 * platform.period_us
-    if isinstance(interaction, Contact):
-        slowest = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng)
-    else:
-        slowest = impact_law_of(scenes).capture_speed_nm_per_us
-    rebound = jnp.maximum(platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))
-    return tips_at(scenes, time, platform.velocity(time) + rebound)
+    platform, time = scenes.platform, 0.75 * scenes.platform.period_us
+    return tips_at(scenes, time, platform.velocity(time) + jax.vmap(rebound_of_leaving)(scenes))
 
 
 def bouncing_tips(scenes: Scene) -> Tips:

@@ -430,10 +430,10 @@ class TabulatedImpact(Impact):
         """Return approach and rebound speed in nm/us and the delay in us at the coordinate, the approach speed."""
         u = coordinate
         place = self._place(u)
-        loss = chebyshev_sum(self.loss, place)
+        loss = polynomials(place, self.loss.shape[0]) @ self.loss
         inside = jnp.minimum(u, self.highest)
         straight = self.outer_nm / _rebound(inside, loss) + self.inner_nm / inside
-        return Speeds(u, _rebound(u, loss), chebyshev_sum(self.time, place) - straight)
+        return Speeds(u, _rebound(u, loss), polynomials(place, self.time.shape[0]) @ self.time - straight)
 
     def errors(self, approach_speed: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the estimated errors of the rebound speed, relative to it, and of the delay in us.
@@ -475,15 +475,3 @@ def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... cou
     first = jnp.ones_like(place)
     _, rest = lax.scan(step, (place, first), None, length=count - 1, unroll=_WRITTEN_OUT)
     return jnp.moveaxis(jnp.concatenate([first[None], rest]), 0, -1)
-
-
-def chebyshev_sum(coefficients: Float[Array, " terms"], place: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the Chebyshev series at places in [-1, 1] by Clenshaw's recurrence."""
-
-    def step(sums, coefficient):
-        ahead, further = sums
-        return (coefficient + 2.0 * place * ahead - further, ahead), None
-
-    nothing = jnp.zeros_like(place)
-    (ahead, further), _ = lax.scan(step, (nothing, nothing), coefficients[:0:-1], unroll=_WRITTEN_OUT)
-    return coefficients[0] + place * ahead - further

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
-from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.derivatives import implicit_root, slope_of
 from afm_jax.strict_json import plain
 
 BRIDGE_NM = 4.7
@@ -211,13 +211,11 @@ class Law(Impact):
 
     def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d u_out/d u_in, a number; 0 where the tip is captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.rebound_speed, (u,), (jnp.ones_like(u),))[1]
+        return slope_of(self.rebound_speed, as_argument(approach_speed))
 
     def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.collision_delay, (u,), (jnp.ones_like(u),))[1]
+        return slope_of(self.collision_delay, as_argument(approach_speed))
 
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
@@ -397,8 +395,7 @@ class TabulatedLaw(Law):
     ):
         """Make a law of columns: see the class."""
         u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        held = float(u[captured - 1]) if captured else 0.0
-        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
+        held = max(captured, default=0.0)
         check_parameter("mass_ng", mass_ng, "positive", optional=True)
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
@@ -462,35 +459,30 @@ class TabulatedLaw(Law):
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
         u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
-        numpy = _numpy_of(u, w, late, rebound_changes, delay_changes, capture_changes, law.capture, law.delay)
-        by_rebound = numpy.asarray(rebound_changes, float)
-        if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
+        by_rebound = np.asarray(rebound_changes, float)
+        if by_rebound.ndim != 2 or by_rebound.shape[1] != len(captured) + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        by_rebound, nothing = by_rebound[:, captured:], numpy.zeros((by_rebound.shape[0], 1))
-        by_delay = nothing if delay_changes is None else numpy.asarray(delay_changes, float)[:, captured:]
-        by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
+        by_rebound, nothing = by_rebound[:, len(captured) :], np.zeros((by_rebound.shape[0], 1))
+        by_delay = nothing if delay_changes is None else np.asarray(delay_changes, float)[:, len(captured) :]
+        by_capture = nothing[:, 0] if capture_changes is None else np.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
-        capture = numpy.asarray(law.capture)
+        capture = np.asarray(law.capture)
 
         def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
             # no rebound, and no distance from capture, changes by more than 1 %
-            relative = numpy.abs(numpy.append(by_rebound, by_capture)) / numpy.append(w, u[0] - capture)
-            small, ends = _SMALL / numpy.maximum(1.0, 100.0 * _SMALL * numpy.max(relative)), []
+            relative = np.abs(np.append(by_rebound, by_capture)) / np.append(w, u[0] - capture)
+            small, ends = _SMALL / np.maximum(1.0, 100.0 * _SMALL * np.max(relative)), []
             for side in (-small, small):
                 rebound, held = w + side * by_rebound, capture + side * by_capture
                 if extrapolated:
-                    held = _capture_speed(u, rebound, 0.0, numpy)
+                    held = _capture_speed(u, rebound, 0.0, np)
                 delayed = None if late is None else late + side * by_delay
                 # the formula beside the table and the splines' knots stay as they are
-                ends.append((held, *_splines(u, rebound, delayed, held, law, numpy)))
+                ends.append((held, *_splines(u, rebound, delayed, held, law, np)))
             names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
             return {name: (end - start) / (2.0 * small) for name, start, end in zip(names, *ends, strict=False)}
 
-        changes = by_rebound, by_delay, by_capture
-        if numpy is jnp:
-            return _replaced(law, deviations=jax.vmap(along)(*changes))
-        each = [along(*change) for change in zip(*changes, strict=True)]
+        each = [along(*change) for change in zip(by_rebound, by_delay, by_capture, strict=True)]
         deviations = {name: jnp.asarray([one[name] for one in each]) for name in each[0]}
         return _replaced(law, deviations=deviations)
 
@@ -669,9 +661,8 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
     if missing:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
-    u, w, late = (_told(name, told.get(name, ())) for name in names)
-    columns, numbers = (u, w, late if late.size else None), told.get("numbers")
-    mass, origin = told.get("mass_ng"), str(told.get("origin", ""))
+    columns = [_told(name, told[name], (len(told[name]),)) for name in names if name in told]
+    numbers, mass, origin = told.get("numbers"), told.get("mass_ng"), str(told.get("origin", ""))
     if not isinstance(numbers, Mapping):
         capture = told.get("capture_speed_nm_per_us")
         return TabulatedLaw(*columns, capture_speed_nm_per_us=capture, mass_ng=mass, origin=origin)
@@ -703,18 +694,16 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     )
 
 
-def _told(name: str, number: Any, shape: tuple[int, ...] | None = None) -> Any:
+def _told(name: str, number: Any, shape: tuple[int, ...]) -> Any:
     """Return a number of a law that a file tells, or an array of them.
 
     Raises:
-        ValueError: if it is no number, not of that shape, or not finite; None: a column, which is checked elsewhere.
+        ValueError: if it is no number, not of that shape, or not finite.
     """
     try:
         found = np.asarray(number, float)
     except (OverflowError, TypeError, ValueError) as error:
         raise ValueError(f"`{name}` of the law must be numbers") from error
-    if shape is None:
-        return found
     if found.shape != shape or not np.isfinite(found).all():
         many = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
         raise ValueError(f"`{name}` of the law must be {many}")
@@ -785,8 +774,8 @@ class Origin:
         return hash(Origin)
 
 
-def _columns_of_law(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, Any, int]:
-    """Return a table's columns, checked as far as their numbers are known, and how many rows are captured.
+def _columns_of_law(approach: Any, rebound: Any, delay: Any = None) -> tuple[Any, Any, Any, list[float]]:
+    """Return the columns of rows that leave, checked as far as their numbers are known, and the speeds captured.
 
     The columns are approach and rebound speed in nm/us and the delay in us; the captured rows are the slowest.
 
@@ -799,7 +788,7 @@ def _columns_of_law(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, 
     if len(u) < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds, but has {len(u)}")
     if is_traced(u):
-        return u, w, late, 0
+        return u, w, late, []
     fall = np.flatnonzero(np.diff(u) <= 0.0)
     if fall.size:
         first, second = u[fall[0]], u[fall[0] + 1]
@@ -812,7 +801,8 @@ def _columns_of_law(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, 
     captured = 0 if is_traced(w) else _captured_rows(u, w)
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
-    return u, w, late, captured
+    late = None if late is None else late[captured:]
+    return u[captured:], w[captured:], late, u[:captured].tolist()
 
 
 def _numpy_of(*values: Any) -> Any:

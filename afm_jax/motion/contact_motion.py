@@ -185,9 +185,10 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
 
     One that has just left starts exactly where contact ends, on its way up, with the derivatives of what was given.
     """
-    leaves = has_just_left(driven.surface, driven.ends_nm, time_us, gap_nm, rate)
+    surface = driven.driving.surface
+    leaves = has_just_left(surface, driven.ends_nm, time_us, gap_nm, rate)
     gap_nm = gap_nm + lax.stop_gradient(jnp.where(leaves, driven.ends_nm - gap_nm, 0.0))
-    slower = jnp.maximum(slowest_departure(driven.surface, time_us) - rate, 0.0)
+    slower = jnp.maximum(slowest_departure(surface, time_us) - rate, 0.0)
     rate = rate + lax.stop_gradient(jnp.where(leaves, slower, 0.0))
     above = leaves | (gap_nm > driven.junction.forms_gap_nm)
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & above
@@ -230,17 +231,17 @@ def _fly(
 
     A tip that is not free stays where it is: its search starts below the level and ends at once.
     """
-    surface = driven.surface
+    cantilever, surface, _ = driven.driving
     gap = jnp.where(free, start.x, driven.forms_nm - 1.0)
     height, speed = surface.position_and_velocity(start.time_us)
     velocity = start.gap_rate + speed
-    flight = Flight(driven.cantilever, surface, start.time_us, velocity, gap, driven.forms_nm)
+    flight = Flight(cantilever, surface, start.time_us, velocity, gap, driven.forms_nm)
     arrival = first_impact(flight, max_steps=_FLIGHT_STEPS, latest_us=until_us - start.time_us)
     in_time = start.time_us + arrival.duration_us < until_us
     arrives = free & (arrival.outcome == Outcome.IMPACT) & in_time
     lost = free & (arrival.outcome == Outcome.STEP_LIMIT)
     duration = jnp.where(arrives, arrival.duration_us, jnp.where(free, until_us - start.time_us, 0.0))
-    position, velocity = driven.cantilever.propagator(duration)(gap + height, velocity)
+    position, velocity = cantilever.propagator(duration)(gap + height, velocity)
     time = start.time_us + duration
     height, speed = surface.position_and_velocity(time)
     gap = jnp.where(arrives, driven.forms_nm, position - height)

@@ -1,7 +1,5 @@
 """Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -136,9 +134,18 @@ def _leaving(scene: Scene) -> State:
     drive = drive_of(scene)
     time = 0.75 * drive.period_us
     height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
-    if isinstance(scene.interaction, Contact):
-        slowest = float(capture_speed(scene.interaction, float(scene.cantilever.mass_ng)))
-    else:
-        slowest = float(scene.interaction.capture_speed_nm_per_us)
-    rebound = max(float(scene.platform.top_speed_nm_per_us), 2.0 * slowest if math.isfinite(slowest) else 0.0)
+    rebound = float(rebound_of_leaving(scene))
     return state(time, height + float(gap_of_departure(scene)), speed + (rebound or drive.angular_frequency))
+
+
+def rebound_of_leaving(scene: Scene) -> Float[Array, ""]:
+    """Return the speed off the platform in nm/us of a tip that begins there: the platform's, or twice that of capture.
+
+    The larger of them; of a scene with an interaction.
+    """
+    interaction = scene.interaction
+    if isinstance(interaction, Contact):
+        slowest = capture_speed(interaction, scene.cantilever.mass_ng)
+    else:
+        slowest = interaction.capture_speed_nm_per_us
+    return jnp.maximum(scene.platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))

@@ -153,6 +153,22 @@ def halved(
     return lax.fori_loop(0, rounds, halve, (low, high))
 
 
+def slope_of(function: Callable[[Array], Array], at: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the derivative of an elementwise function, by automatic differentiation."""
+    return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
+
+
+def value_and_slopes(function: Callable[[Array], Array], at: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return the value of a function of some numbers, and its derivatives by each, which come last."""
+
+    def twice(at: Array) -> tuple[Array, Array]:
+        value = function(at)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(at)
+    return value, slopes
+
+
 def largest(values: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the largest of some values, with the derivative of that one.
 

@@ -8,31 +8,16 @@ In a batch of slots with few guesses `where` names the slots that hold one. A st
 of f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
 """
 
-import enum
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.solve.derivatives import implicit_system, solved_columns
-
-
-class NewtonOutcome(enum.IntEnum):
-    """How a search by Newton's method ended."""
-
-    CONVERGED = 0
-    """The last step and the residual before it are within their tolerances."""
-    NOT_CONVERGED = 1
-    """All rounds are used up, or no halved step lowers the residual."""
-    NO_STEP = 2
-    """The residual is not finite there, or its derivative is singular."""
-    NOT_ASKED = 3
-    """No root was asked for: `where` is False."""
+from afm_jax.solve.derivatives import implicit_system, solved_columns, value_and_slopes
 
 
 class Newton(NamedTuple):
@@ -70,8 +55,6 @@ class Root(NamedTuple):
     """Where a search inside a program ended."""
 
     x: Float[Array, " n"]
-    outcome: Int[Array, ""]
-    """A `NewtonOutcome`."""
     residual: Float[Array, " n"]
     """The residual before the last step; infinite where no round was made."""
     slopes: Float[Array, "n n"]
@@ -101,34 +84,26 @@ def newton(
     fixed = lax.stop_gradient(parameters)
     begin = lax.stop_gradient(guess)
 
-    def twice(x: Array) -> tuple[Array, Array]:
-        value = residual(x, fixed)
-        return value, value
-
-    def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
-        done, (x, outcome, *before) = state
-        slopes, value = jax.jacfwd(twice, has_aux=True)(x)
+    def improve(state: tuple[Array, Array, Root]) -> tuple[Array, Array, Root]:
+        done, going, (x, *before) = state
+        value, slopes = value_and_slopes(lambda x: residual(x, fixed), x)
         full = -solved_columns(list(slopes.T), value)
         step, sizes = settings.limited(x, full)
         # of two equations the solution is 0 where the matrix is singular
         stands = jnp.all(full == 0.0) & jnp.any(value != 0.0)
-        finite = jnp.all(jnp.isfinite(step)) & ~stands
+        moves = going & jnp.all(jnp.isfinite(step)) & ~stands
         small = jnp.all(jnp.abs(value) <= settings.residual_tolerance)
         found = small & jnp.all(sizes <= settings.step_tolerance)
-        going = outcome == NewtonOutcome.NOT_CONVERGED
-        now = jnp.where(found, NewtonOutcome.CONVERGED, outcome)
-        now = jnp.where(finite, now, NewtonOutcome.NO_STEP)
         here = (jnp.where(going, new, old) for new, old in zip((value, slopes), before, strict=True))
-        return done + 1, Root(jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), *here)
+        return done + 1, moves & ~found, Root(jnp.where(moves, x + step, x), *here)
 
-    def unsettled(state: tuple[Array, Root]) -> Array:
-        return (state[0] < settings.rounds) & (state[1].outcome == NewtonOutcome.NOT_CONVERGED)
+    def unsettled(state: tuple[Array, Array, Root]) -> Array:
+        return (state[0] < settings.rounds) & state[1]
 
     asked = jnp.ones((), bool) if where is None else where
-    first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
     # the batch's own from the start: a loop whose state joins the batch later is traced once more
-    start = Root(begin, first, jnp.abs(begin) + jnp.inf, jnp.outer(jnp.zeros(begin.shape[0]), begin))
-    root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
+    start = Root(begin, jnp.abs(begin) + jnp.inf, jnp.outer(jnp.zeros(begin.shape[0]), begin))
+    root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), asked, start))[2]
     return root._replace(x=implicit_system(residual, root.x, parameters))
 
 
@@ -146,17 +121,12 @@ class Roots(NamedTuple):
     """Where the searches of all rows ended."""
 
     x: Float[np.ndarray, "rows n"]
-    outcome: Int[np.ndarray, " rows"]
-    """A `NewtonOutcome` each."""
+    converged: Bool[np.ndarray, " rows"]
+    """Which rows have a root: the last step and the residual before it are within their tolerances."""
     slopes: Float[np.ndarray, "rows n n"]
     """Derivatives of the residuals before the last step; NaN where there are none."""
     details: list[Any]
     """What the last evaluation of each row has found besides; None where there is nothing."""
-
-    @property
-    def converged(self) -> Bool[np.ndarray, " rows"]:
-        """Which rows have a root."""
-        return self.outcome == NewtonOutcome.CONVERGED
 
 
 def newton_rows(
@@ -174,7 +144,7 @@ def newton_rows(
     count, unknowns = np.shape(guesses)
     roots = Roots(
         x=np.array(guesses, float),
-        outcome=np.full(count, NewtonOutcome.NOT_CONVERGED),
+        converged=np.zeros(count, bool),
         slopes=np.full((count, unknowns, unknowns), np.nan),
         details=[None] * count,
     )
@@ -190,8 +160,7 @@ def newton_rows(
         finite = np.isfinite(full).all(axis=1)
         small = np.all(np.abs(here.residual) <= settings.residual_tolerance, axis=1)
         found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)
-        roots.outcome[rows[found & ~too_far]] = NewtonOutcome.CONVERGED
-        roots.outcome[rows[~finite & ~too_far]] = NewtonOutcome.NO_STEP
+        roots.converged[rows] = found & ~too_far
         roots.slopes[rows[~too_far]] = here.slopes[~too_far]
         for row, detail in zip(rows, here.details or (), strict=bool(here.details)):
             roots.details[row] = detail
@@ -201,7 +170,7 @@ def newton_rows(
         lowest[rows], halved[rows] = np.fmin(size, lowest[rows]), np.where(too_far, halved[rows] + 1, 0)
         given_up = rows[halved[rows] > settings.halvings]
         roots.x[given_up] -= step[given_up]
-        rows = np.setdiff1d(rows[roots.outcome[rows] == NewtonOutcome.NOT_CONVERGED], given_up)
+        rows = np.setdiff1d(rows[too_far | finite & ~found], given_up)
     return roots
 
 

@@ -46,6 +46,7 @@ from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.scenefile import load_scene, read_scene
+from afm_jax.solve.derivatives import value_and_slopes
 from afm_jax.studies.timing import compiled_for, progress, seconds_a_call
 
 Row = dict[str, Any]
@@ -184,11 +185,9 @@ class AccuracyProblem:
         return self.errors(*self._with_slopes(self.finest[1]))
 
     def _with_slopes(self, setting: Any) -> tuple[Values, Slopes]:
-        """Return values and slopes, by programs that compile quickly: they are not timed."""
-        value = partial(self.solve, setting)
-        both = [compiled_for(each, self.at, options=quick_options(0)) for each in (value, jax.jacfwd(value))]
-        values, slopes = (np.asarray(run(self.at)) for run, _ in both)
-        return values, slopes
+        """Return values and slopes, by a program that compiles quickly: it is not timed."""
+        value = partial(value_and_slopes, partial(self.solve, setting))
+        return jax.tree.map(np.asarray, compiled_for(value, self.at, options=quick_options(0))[0](self.at))
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
         """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""

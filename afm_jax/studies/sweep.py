@@ -485,16 +485,12 @@ class SweepPlan:
 
     def compute(self, region: Region) -> Columns:
         """Return the results of a chunk, arrays of its shape with the recorder's own dimensions behind."""
-        names = [name for axis in self.axes for name in axis.columns]
         places = np.meshgrid(*(np.arange(part.start, part.stop) for part in region), indexing="ij")
-        values = [
-            column[place.ravel()]
-            for axis, place in zip(self.axes, places, strict=True)
-            for column in axis.columns.values()
-        ]
+        pairs = list(zip(self.axes, places, strict=True))
+        values = {name: column[at.ravel()] for axis, at in pairs for name, column in axis.columns.items()}
         # a worker has JAX's usual precision, whatever its caller has said
         with jax.enable_x64(True):  # noqa: FBT003
-            found = self.recorder.work(dict(zip(names, values, strict=True)))
+            found = self.recorder.work(values)
         arrays = {name: np.asarray(column) for name, column in found.items()}
         return {name: array.reshape(places[0].shape + array.shape[1:]) for name, array in arrays.items()}
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from afm_jax.checks import check_count, checked, in_float64
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.solve.derivatives import value_and_slopes
 from fitting.infer.closest import closest_parameters, covariance_of_unknowns
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
@@ -164,14 +165,9 @@ class LogDensity:
 
     def __call__(self, z: Float[Array, " k"]) -> Float[Array, ""]:
         """Return the logarithm of the density by z, but for a constant; minus infinity outside the ranges."""
-
-        def twice(z: Float[Array, " k"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-            residual = self.residual(z)
-            return residual, residual
-
         # the orbits' slopes come by forward mode: nothing of the search is differentiated backward
         still = lax.stop_gradient(z)
-        slope, residual = lax.stop_gradient(jax.jacfwd(twice, has_aux=True)(still))
+        residual, slope = lax.stop_gradient(value_and_slopes(self.residual, still))
         log_likelihood = -0.5 * residual @ residual - residual @ slope @ (z - still)
         values, _, log_prior = self.place(z)
         inside = jnp.isfinite(log_likelihood)

@@ -11,16 +11,16 @@ polynomial too.
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.checks import as_argument, check_parameter, readable
 from afm_jax.contact.parameters import CONTACT_RANGES
+from afm_jax.solve.derivatives import slope_of
 
 
 class Parameters(eqx.Module):
@@ -137,11 +137,6 @@ class ForceSum(Force):
         gap = as_argument(gap_nm)
         parts = (getattr(term, what)(gap) for term in self.terms if isinstance(term, kind))
         return sum(parts, start=jnp.zeros_like(gap))
-
-
-def slope_of(function: Callable[[Array], Array], at: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the derivative of an elementwise function, by automatic differentiation."""
-    return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
 
 
 def terms_of(force: Force) -> tuple[Force, ...]:
