@@ -18,7 +18,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, singledispatch
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
@@ -73,33 +73,42 @@ def is_abstract(value: Any) -> bool:
     return isinstance(value, Tracer | ShapeDtypeStruct)
 
 
+@singledispatch
+def as_json(result: Any) -> dict[str, Any]:
+    """Return a result as its command writes it: its fields, if its kind does not register other keys."""
+    return dict(fields_of(result))
+
+
 def saved(result: Any) -> dict[str, Any]:
     """Return a result as the object of its JSON file.
 
     Raises:
         ValueError: if a number in it is traced.
     """
-    own = result.to_dict() if hasattr(result, "to_dict") else {}
-    head = {"format": FORMAT, "format_version": FORMAT_VERSION} | own
+    has_own = as_json.dispatch(type(result)) is not as_json.dispatch(object)
+    head = {"format": FORMAT, "format_version": FORMAT_VERSION} | (as_json(result) if has_own else {})
     meanings = {
         name: {str(int(each)): getattr(each, "sentence", each.name.lower().replace("_", " ")) for each in kind}
         for name, kind in getattr(type(result), "_words", {}).items()
     }
+    if not getattr(type(result), "_whole", True):
+        return head
     return head | {"afm_jax": __version__, "meanings": meanings, **_record(result, type(result).__name__)}
 
 
-def save(result: Any, path: str | Path) -> None:
+def save(result: Any, path: str | Path, *, named_by_user: bool = True) -> None:
     """Write a result as a JSON file, whole or not at all; `load` gives it back.
 
     Args:
         result: a public result, or any record of numbers, arrays, texts and records.
         path: of the file.
+        named_by_user: as for `write_whole`.
 
     Raises:
         ValueError: if a number in it is traced: save outside `jit`, `vmap` and `grad`.
     """
     lines = (f"{json.dumps(key)}: {strict_json(value)}" for key, value in saved(result).items())
-    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=True)
+    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=named_by_user)
 
 
 @checked

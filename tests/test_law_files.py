@@ -10,6 +10,7 @@ import pytest
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.cli.scenes import as_drawn, with_fitted_law
+from afm_jax.saved import as_json
 from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.scenefile.parameter_paths import scene_family
 from tests.test_scenefile import CANTILEVER, PLATFORM
@@ -107,7 +108,7 @@ def test_a_law_of_another_mass_and_a_batch_of_laws_are_refused(law, tmp_path):
 
 def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(tmp_path):
     instant = TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS), mass_ng=1.5)
-    told = instant.to_dict() | {"collision_delay_us": [0.0] * 12}
+    told = as_json(instant) | {"collision_delay_us": [0.0] * 12}
     fit = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": told}
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     assert eqx.tree_equal(afm.load_law(tmp_path / "fit.json"), instant)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fitting
+from afm_jax.columns import csv_columns, rows_of
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.saved import save
@@ -16,7 +17,6 @@ from fitting.experiments.prior import prior_of_fit
 from fitting.infer.fit import fit
 from fitting.infer.result import FitResult, FittedTable
 from fitting.infer.several import Parts, pulls_of
-from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.fit_tables import example_amplitudes, rows, simulated, standard_errors_of, values_of
@@ -129,9 +129,10 @@ def made_joint() -> FitResult:
 
 def test_reports_say_each_tables_pull(tmp_path: Path):
     result = made_joint()
-    said = " ".join(summary(result).split())
+    said = " ".join(str(result).split())
     assert "a.csv 4/4 3.0/7 1.25 b.csv 4/4 3.0/7 -" in said
-    assert row_records(result)[5] | {"table": "b.csv", "line": 2} == row_records(result)[5]
+    rows = rows_of(csv_columns(result)["fit_rows.csv"])
+    assert rows[5] | {"table": "b.csv", "line": 2} == rows[5]
     # saved and read again, and as a prior
     save(result, tmp_path / "fit.json")
     again = fitting.load(tmp_path / "fit.json")

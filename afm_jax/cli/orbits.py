@@ -50,5 +50,5 @@ def orbits(
         with session.working("searching for orbits (the first run compiles for some seconds)"):
             search = contact_orbits if resolved else many_impact_orbits
             of_scene = search(scene.scene, order, impacts)
-    files = {"orbits.png": picture_of("dynamics:orbits_figure", of_scene)}
-    return Output.of(OrbitTable(scene.scene, order, of_scene, impacts), files=files)
+    orbits = OrbitTable(scene.scene, order, of_scene, impacts)
+    return Output.of(orbits, files={"orbits.png": picture_of("dynamics:orbits_figure", orbits)})

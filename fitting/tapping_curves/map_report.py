@@ -8,19 +8,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import label_axes, new_figure, png_of
+from afm_jax.report import Bullets, Section, Table, sections
+from afm_jax.saved import as_json
 from afm_jax.strict_json import strict_json
 from afm_jax.units import words_of
 from afm_jax.whole_files import whole_folder, write_whole
-from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.tapping_curves.maps import ARRAYS, PixelState, TappingMap
 
 _MOST = 1024
 """Pixels a side of a picture."""
 
 
-def map_report(result: TappingMap) -> Report:
-    """Return a map as sections: median energy and virial with the two kinds of errors, what is known, notes."""
-    counts, unit, numbers = result.counts, result.unit, result.to_dict()
+@sections.register
+def _(result: TappingMap) -> list[Section]:
+    counts, unit, numbers = result.counts, result.unit, as_json(result)
     rows, columns = result.state.shape
     masked = [f"{count} {name}" for name, count in counts.items() if count and name != "used"]
     head = ["", f"2.5 % ({unit})", "median", "97.5 %", "error of a pixel", "error of all in common"]
@@ -39,19 +40,14 @@ def map_report(result: TappingMap) -> Report:
     known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
     of_known = ["known", "value", "unit", "from"]
     table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
-    sections = [
-        ReportSection("Energy and virial", [table]),
-        ReportSection("Errors", [Text(common if cells else "")]),
-        ReportSection("What is known", [Table("Of the instrument", of_known, known, words=of_known[2:])]),
-        ReportSection("Notes", [Bullets(result.notes, "Notes:")]),
+    title = f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used"
+    return [
+        Section(f"{title}, masked: {', '.join(masked)}" if masked else f"{title}, none masked", []),
+        Section("Energy and virial", [table]),
+        Section("Errors", [common if cells else None]),
+        Section("What is known", [Table("Of the instrument", of_known, known)]),
+        Section("Assumptions", [Bullets(result.notes, "Notes:")]),
     ]
-    return Report(
-        title=f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used, "
-        + (f"masked: {', '.join(masked)}" if masked else "none masked"),
-        valid=result.valid,
-        reasons=result.reasons,
-        sections=sections,
-    )
 
 
 def map_figure(result: TappingMap) -> Figure:
@@ -85,11 +81,10 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
         folder: that is there already.
         formats: of "npz", "gsf" and "zarr".
     """
-    payload = {"format": "afm-jax tapping-map", "format_version": 1, **result.to_dict()}
     contents: dict[str, str | bytes] = {
         "map.png": png_of(map_figure(result)),
-        "map.json": strict_json(payload) + "\n",
-        "map.txt": text_of(map_report(result)) + "\n",
+        "map.json": strict_json(as_json(result)) + "\n",
+        "map.txt": f"{result}\n",
     }
     if "npz" in formats:
         packed = io.BytesIO()

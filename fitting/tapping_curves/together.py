@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from afm_jax.checks import checked, in_float64
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
@@ -48,7 +49,12 @@ class CurveScatter(CurveBranch):
     energy_common_error_aj: Float[np.ndarray, " points"]
 
 
-@public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
+@public_result(
+    picture="fitting.tapping_curves.pictures:together_figure",
+    rows="rows",
+    home="fitting.tapping_curves.report",
+    whole=False,
+)
 @dataclass(frozen=True, kw_only=True)
 class TappingTogether(JudgedResult):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
@@ -99,20 +105,21 @@ class TappingTogether(JudgedResult):
         """Return a text or mappings about energies in aJ with the unit that they have, that of the first curve."""
         return self.curves[0].in_unit(said) if self.curves else said
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
-        return self.in_unit(
-            plain(
-                {
-                    "valid": self.valid,
-                    "reasons": self.reasons,
-                    "curves": [one.table.source for one in self.curves],
-                    "common_nuisances": nuisances_as_dict(self.common_nuisances),
-                    "agreement_p_value": self.agreement_p_value,
-                    "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
-                }
-            )
-        )
+
+@as_json.register
+def _(result: TappingTogether) -> dict[str, Any]:
+    # each curve's own is in `curves`
+    told = {
+        "format": "afm-jax tapping together",
+        "format_version": 1,
+        "valid": result.valid,
+        "reasons": result.reasons,
+        "curves": [one.table.source for one in result.curves],
+        "common_nuisances": nuisances_as_dict(result.common_nuisances),
+        "agreement_p_value": result.agreement_p_value,
+        "branches": [{**vars(one), "branch": one.way} for one in result.scatter],
+    }
+    return result.in_unit(plain(told))
 
 
 @checked
