@@ -7,9 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import singledispatch
 from typing import Any
 
+CsvColumns = Mapping[str, Mapping[str, Any]]
+"""Columns by their names, of each file by its name."""
+
 
 @singledispatch
-def csv_columns(result: Any) -> dict[str, Mapping[str, Any]]:  # noqa: ARG001 (kinds of results register theirs)
+def csv_columns(result: Any) -> CsvColumns:  # noqa: ARG001 (kinds of results register theirs)
     """Return the columns, by their names, of each CSV file of a result, by the file's name."""
     return {}
 

@@ -116,6 +116,7 @@ def table_of(cells: Mapping[str, Cell], rows: Sequence[Any], *, form: str = ".6g
 
 
 def _cell(row: Any, cell: Cell, form: str) -> str:
+    value: Any = None
     if callable(cell):
         value = cell(row)
     else:
@@ -168,12 +169,7 @@ def page_of(*results: Any, drawn: Mapping[str, str] | None = None, template: str
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 (only a page needs it)
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        finalize=_allowed,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, finalize=_allowed, undefined=StrictUndefined
     )
     environment.filters["signed"] = signed
     first, *others = _sections_of(results)
@@ -242,48 +238,31 @@ def signed(words: str) -> str:
 
 def in_words(value: Any, words: type[enum.IntEnum] | None = None) -> str:  # noqa: PLR0911 (one return a kind of value)
     """Return a value as text: a number, arrays by their range, outcomes by their names."""
-    if value is None:
-        return "none"
     if is_abstract(value):
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
-    if is_array(value) or isinstance(value, bool | int | float):
-        return _numbers_in_words(np.asarray(value), words)
-    if isinstance(value, str | Path):
-        return " ".join(str(value).split()) or "''"
     if is_record(value):
-        return f"{type(value).__name__}({', '.join(f'{name} {in_words(item)}' for name, item in fields_of(value))})"
+        return f"{type(value).__name__}({in_words(dict(fields_of(value)))})"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {in_words(item)}" for key, item in value.items()) or "nothing"
     if isinstance(value, list | tuple):
         more = [f"and {len(value) - _SHOWN} more"] * (len(value) > _SHOWN)
         return "; ".join([*map(in_words, value[:_SHOWN]), *more]) or "nothing"
-    return "a function" if callable(value) else type(value).__name__
-
-
-def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
-    flat = array.ravel()
-    shape = "" if array.ndim < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, array.shape))}) "
+    if not is_array(value):
+        value = "none" if value is None else "a function" if callable(value) else value
+        return _number(value) if isinstance(value, bool | int | float) else " ".join(str(value).split()) or "''"
+    flat = np.ravel(value)
+    shape = "" if np.ndim(value) < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, np.shape(value)))}) "
     if words is not None:
         names = {int(each): each.name.lower().replace("_", " ") for each in words}
-        if flat.size == 1:
-            return getattr(words(flat[0]), "sentence", names[flat[0]]) if flat[0] in names else str(flat[0])
-        return shape + ", ".join(f"{count} {names.get(n, n)}" for n, count in Counter(flat.tolist()).items())
-    if flat.dtype.kind not in "biufc":
-        return f"{shape}{flat.dtype}"
-    if flat.size <= _SHOWN:
-        # of several numbers those that are not known are dashes, as in tables
-        unknown = "-" if flat.size > 1 else "not known"
-        return shape + (", ".join(_one(each, unknown) for each in flat.tolist()) or "nothing")
-    if flat.dtype.kind == "b":
-        return f"{shape}{flat.sum()} of {flat.size} yes"
-    size = np.abs(flat) if flat.dtype.kind == "c" else flat
-    finite = size[np.isfinite(size)]
-    ends = "none known" if not finite.size else f"{_one(finite.min().item())} to {_one(finite.max().item())}"
-    unknown = flat.size - finite.size
-    return f"{shape}{ends}" + (f", {unknown} not known" if unknown and finite.size else "")
+        counts = Counter(names.get(each, str(each)) for each in flat.tolist())
+        return shape + ", ".join(f"{count} {name}" if flat.size > 1 else name for name, count in counts.items())
+    if flat.size <= _SHOWN or flat.dtype.kind not in "iuf":
+        return shape + ", ".join(map(_number, flat[:_SHOWN].tolist())) + ", ..." * (flat.size > _SHOWN)
+    finite = flat[np.isfinite(flat)].tolist()
+    return f"{shape}{_number(min(finite))} to {_number(max(finite))}" if finite else f"{shape}none known"
 
 
-def _one(value: Any, unknown: str = "not known") -> str:
+def _number(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return unknown if value != value else f"{value:.6g}"  # noqa: PLR0124 (NaN alone is not itself)
+    return "-" if value != value else f"{value:.6g}"  # noqa: PLR0124 (NaN alone is not itself)

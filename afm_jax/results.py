@@ -10,7 +10,7 @@ import enum
 import importlib
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
 
@@ -19,7 +19,8 @@ import numpy as np
 from afm_jax.checks import in_float64, is_array
 from afm_jax.columns import csv_columns, csv_text
 from afm_jax.report import at_home, lines_of, page_of, pictures_of, sections, text_of
-from afm_jax.saved import as_json, fields_of, is_record, save
+from afm_jax.saved import fields_of, is_record, save, saved
+from afm_jax.strict_json import strict_json
 from afm_jax.units import unit_of
 from afm_jax.whole_files import write_whole
 
@@ -35,7 +36,6 @@ class Result:
     """The methods that `public_result` gives; what a named tuple has instead of this base: see `ResultTuple`."""
 
     _picture: ClassVar[str]
-    _rows: ClassVar[str]
     _home: ClassVar[str]
     _words: ClassVar[dict[str, type[enum.IntEnum]]]
 
@@ -79,45 +79,37 @@ class Result:
             name: of the files; else that of its kind, such as fit.html.
             more: results whose sections follow on the page and in the text.
         """
-        folder, results = Path(folder), (self, *more)
+        folder, results, data = Path(folder), (self, *more), saved(self)
         folder.mkdir(parents=True, exist_ok=True)
-        name = name or str(as_json(self).get("format", "result")).rpartition(" ")[2]
+        name = name or data["format"].rpartition(" ")[2]
         style = importlib.import_module("afm_jax.plots.picture_style")
         figures = {function: self._drawn(function) for function in pictures_of(self) or [self._picture]}
         # SVG files have the layout of the PNG drawn before
         pixels = np.concatenate([style.pixels_of(figure, _DPI) for figure in figures.values()])
         drawn = {key: base64.b64encode(style.svg_of(figure)).decode() for key, figure in figures.items()}
+        tables = csv_columns(self) or {f"{name}.csv": _columns_of_one_shape(self)[1]}
         contents: dict[str, str | bytes] = {
             f"{name}.html": page_of(*results, drawn=drawn),
             f"{name}.txt": text_of(*results) + "\n",
             f"{name}.png": style.png_of_pixels(pixels, _DPI),
-            **{file: csv_text(columns) for file, columns in csv_columns(self).items()},
+            f"{name}.json": strict_json(data) + "\n",
+            **{file: csv_text(columns) for file, columns in tables.items()},
         }
         for file, content in contents.items():
             write_whole(folder / file, content)
-        save(self, folder / f"{name}.json", named_by_user=False)
-        return [folder / file for file in (*contents, f"{name}.json")]
+        return [folder / file for file in contents]
 
     def to_pandas(self) -> "DataFrame":
         """Return a result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
         pandas = _needed("pandas")
-        if self._rows:
-            records: Any = getattr(self, self._rows)
-            if isinstance(records, Mapping):
-                plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
-                return pandas.DataFrame.from_dict(plain, orient="index")
-            return pandas.DataFrame(list(records))
         for columns in csv_columns(at_home(self)).values():
             return pandas.DataFrame(dict(columns))
-        columns = {name: array for name, (array, _) in known_columns(self).items()}
-        shapes = [array.shape for array in columns.values() if array.ndim]
-        shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
-        table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
+        shape, columns = _columns_of_one_shape(self)
+        table = pandas.DataFrame(columns)
         table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
         if len(shape) > 1:
             table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
-        known = known_rows(self, shape).ravel()
-        return table if known.all() else table[known]
+        return table[known_rows(self, shape).ravel()] if shape else table
 
     def to_xarray(self) -> "Dataset":
         """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
@@ -178,7 +170,6 @@ else:
 def public_result(
     *,
     picture: str = "afm_jax.plots.results:figure_of",
-    rows: str = "",
     home: str = "",
     whole: bool = True,
     **words: type[enum.IntEnum],
@@ -187,8 +178,6 @@ def public_result(
 
     Args:
         picture: the function that draws it, "module:function"; as a rule its arrays against the first of them.
-        rows: the attribute that is its table, mappings; as a rule the columns of its first CSV file, or its arrays of
-            one shape.
         home: the module that registers how it is shown; "": that of the class.
         whole: whether its file holds all its fields, and gives it back; else what its command writes.
         words: the enumeration of each field of integers that has one.
@@ -198,7 +187,7 @@ def public_result(
         methods = {name: method for name, method in vars(Result).items() if callable(method)}
         methods["report"] = vars(kind).get("report", Result.report)
         methods = {name: in_float64(method, loaded=True) for name, method in methods.items()}
-        known = {"_picture": picture, "_rows": rows, "_home": home, "_whole": whole, "_words": words}
+        known = {"_picture": picture, "_home": home, "_whole": whole, "_words": words}
         for name, value in {**methods, **known}.items():
             setattr(kind, name, value)
         return kind
@@ -228,6 +217,14 @@ def known_columns(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
         array, dimensions = columns[name]
         columns[name] = np.where(gaps, math.nan, array), dimensions
     return columns
+
+
+def _columns_of_one_shape(record: Any) -> tuple[tuple[int, ...], dict[str, np.ndarray]]:
+    """Return the shape that most arrays of a record have, and these as columns."""
+    columns = {name: array for name, (array, _) in known_columns(record).items()}
+    shapes = [array.shape for array in columns.values() if array.ndim]
+    shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
+    return shape, {name: array.ravel() for name, array in columns.items() if array.shape == shape}
 
 
 def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -75,8 +75,8 @@ def is_abstract(value: Any) -> bool:
 
 @singledispatch
 def as_json(result: Any) -> dict[str, Any]:
-    """Return a result as its command writes it: its fields, if its kind does not register other keys."""
-    return dict(fields_of(result))
+    """Return a result as its command writes it: fields and verdict, if its kind does not register other keys."""
+    return dict(fields_of(result)) | ({"valid": result.valid} if hasattr(result, "valid") else {})
 
 
 def saved(result: Any) -> dict[str, Any]:
@@ -96,19 +96,18 @@ def saved(result: Any) -> dict[str, Any]:
     return head | {"afm_jax": __version__, "meanings": meanings, **_record(result, type(result).__name__)}
 
 
-def save(result: Any, path: str | Path, *, named_by_user: bool = True) -> None:
+def save(result: Any, path: str | Path) -> None:
     """Write a result as a JSON file, whole or not at all; `load` gives it back.
 
     Args:
         result: a public result, or any record of numbers, arrays, texts and records.
         path: of the file.
-        named_by_user: as for `write_whole`.
 
     Raises:
         ValueError: if a number in it is traced: save outside `jit`, `vmap` and `grad`.
     """
     lines = (f"{json.dumps(key)}: {strict_json(value)}" for key, value in saved(result).items())
-    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=named_by_user)
+    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=True)
 
 
 @checked

@@ -24,7 +24,7 @@ from afm_jax.checks import (
     refuse_float32,
     require_float64,
 )
-from afm_jax.columns import csv_columns, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.contact.bridge_leg import (
     Passage,
     approach_through_bridge,
@@ -464,7 +464,7 @@ def _(result: Collisions) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Collisions) -> dict[str, dict[str, list[Any]]]:
+def _(result: Collisions) -> CsvColumns:
     return {"collide.csv": result.columns}
 
 

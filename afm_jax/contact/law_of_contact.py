@@ -28,7 +28,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.bridge_leg import collocate, margin_of, pull_at, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Contact
@@ -385,13 +385,13 @@ class ContactLaws(ResultTuple):
 
 
 @as_json.register
-def _(result: ContactLaws) -> dict[str, Any]:
-    first, delay = result.formulas[0], result.delay
+def _(laws: ContactLaws) -> dict[str, Any]:
+    first, delay = laws.formulas[0], laws.delay
     return {
         "residuals": "relative",
         "speed_range_nm_per_us": first.speed_range,
         "points": len(first.approach_speed_nm_per_us),
-        "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in result.formulas],
+        "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in laws.formulas],
         "contact_capture_speed_nm_per_us": first.contact_capture_speed_nm_per_us,
         "delay": {
             **{name: getattr(delay.delay, name) for name in _DELAY_NUMBERS},
@@ -399,13 +399,13 @@ def _(result: ContactLaws) -> dict[str, Any]:
             "worst_us": delay.worst_us,
             "speed_range_nm_per_us": delay.speed_range,
         },
-        "law": as_json(result.law),
+        "law": as_json(laws.law),
     }
 
 
 @sections.register
-def _(result: ContactLaws) -> list[Section]:
-    first, delay = result.formulas[0], result.delay
+def _(laws: ContactLaws) -> list[Section]:
+    first, delay = laws.formulas[0], laws.delay
     formulas: dict[str, Cell] = {
         "law": "model",
         "r": "r:.5f",
@@ -420,7 +420,7 @@ def _(result: ContactLaws) -> list[Section]:
     numbers = ", ".join(f"{name} {float(getattr(delay.delay, name)):.4g}" for name in _DELAY_NUMBERS)
     errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
     parts = [
-        table_of(formulas, result.formulas),
+        table_of(formulas, laws.formulas),
         f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
         "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
         "Delay law in us: hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
@@ -430,15 +430,15 @@ def _(result: ContactLaws) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: ContactLaws) -> dict[str, dict[str, Any]]:
-    first = result.formulas[0]
+def _(laws: ContactLaws) -> CsvColumns:
+    first = laws.formulas[0]
     models = {
         "approach_speed_nm_per_us": first.approach_speed_nm_per_us,
         "rebound_speed_nm_per_us": first.rebound_speed_nm_per_us,
-        **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in result.formulas},
-        **{f"{law.model}_relative_error": law.relative_error for law in result.formulas},
+        **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in laws.formulas},
+        **{f"{law.model}_relative_error": law.relative_error for law in laws.formulas},
     }
-    delays = {name: value for name, value in vars(result.delay).items() if name != "delay"}
+    delays = {name: value for name, value in vars(laws.delay).items() if name != "delay"}
     return {"law_models.csv": models, "law_delay.csv": delays}
 
 

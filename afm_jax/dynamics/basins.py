@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Tips, advance
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
@@ -128,7 +128,7 @@ def _(result: Basins) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Basins) -> dict[str, dict[str, Any]]:
+def _(result: Basins) -> CsvColumns:
     # a row a start, and a row an impact of an attractor
     names = np.array([attractor.name for attractor in result.attractors])
     phase, speed = np.meshgrid(result.phase_rad, result.rebound_speed_nm_per_us)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips
 from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
@@ -71,54 +71,54 @@ class BifurcationDiagram(ResultTuple):
 
 
 @as_json.register
-def _(result: BifurcationDiagram) -> dict[str, Any]:
-    return _probability(result) | {
-        "direction": result.direction,
-        "complete": result.complete,
-        "values": result.values,
-        "verdicts": result.verdicts.names(),
-        "impacts": result.verdicts.impacts,
-        "periods": result.verdicts.periods,
-        "restarted": result.restarted,
-        "phase_rad": [row[np.isfinite(row)] for row in result.phase_rad],
-        "platform_height_nm": [row[np.isfinite(row)] for row in result.height_nm],
+def _(ramp: BifurcationDiagram) -> dict[str, Any]:
+    return _probability(ramp) | {
+        "direction": ramp.direction,
+        "complete": ramp.complete,
+        "values": ramp.values,
+        "verdicts": ramp.verdicts.names(),
+        "impacts": ramp.verdicts.impacts,
+        "periods": ramp.verdicts.periods,
+        "restarted": ramp.restarted,
+        "phase_rad": [row[np.isfinite(row)] for row in ramp.phase_rad],
+        "platform_height_nm": [row[np.isfinite(row)] for row in ramp.height_nm],
     }
 
 
-def _probability(result: BifurcationDiagram) -> dict[str, np.ndarray]:
-    probability = result.verdict_probability
+def _probability(ramp: BifurcationDiagram) -> dict[str, np.ndarray]:
+    probability = ramp.verdict_probability
     return {} if probability is None else {"verdict_probability": probability}
 
 
 @sections.register
-def _(result: BifurcationDiagram) -> list[Section]:
+def _(ramp: BifurcationDiagram) -> list[Section]:
     # the commonest kinds of motion
-    counts = Counter(result.verdicts.names()).most_common()
+    counts = Counter(ramp.verdicts.names()).most_common()
     words = [f"{name} at {count}" for name, count in counts[:6]]
     others = sum(count for _, count in counts[6:])
     words += [f"others at {others}"] if others else []
-    return [Section("", [f"ramped {result.direction}: {', '.join(words)}"])]
+    return [Section("", [f"ramped {ramp.direction}: {', '.join(words)}"])]
 
 
 @csv_columns.register
-def _(result: BifurcationDiagram, parameter: str = "value") -> dict[str, dict[str, np.ndarray]]:
+def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
     # a row a value, an impact, and a height when the drive's phase is 0
-    verdicts = {"verdict": np.array(result.verdicts.names()), "restarted": result.restarted}
+    verdicts = {"verdict": np.array(ramp.verdicts.names()), "restarted": ramp.restarted}
     impacts = {
-        "phase_rad": result.phase_rad,
-        "approach_speed_nm_per_us": result.approach_nm_per_us,
-        "velocity_after_nm_per_us": result.velocity_after_nm_per_us,
-        "platform_height_nm": result.height_nm,
+        "phase_rad": ramp.phase_rad,
+        "approach_speed_nm_per_us": ramp.approach_nm_per_us,
+        "velocity_after_nm_per_us": ramp.velocity_after_nm_per_us,
+        "platform_height_nm": ramp.height_nm,
     }
     files = {
-        "bifurcation.csv": (verdicts | _probability(result), np.ones(len(result.values), bool)),
-        "impacts.csv": (impacts, np.isfinite(result.phase_rad)),
-        "strobe.csv": ({"height_nm": result.strobe_height_nm}, np.isfinite(result.strobe_height_nm)),
+        "bifurcation.csv": (verdicts | _probability(ramp), np.ones(len(ramp.values), bool)),
+        "impacts.csv": (impacts, np.isfinite(ramp.phase_rad)),
+        "strobe.csv": ({"height_nm": ramp.strobe_height_nm}, np.isfinite(ramp.strobe_height_nm)),
     }
     return {
         file: {
-            "direction": np.full(there.sum(), result.direction),
-            parameter: np.repeat(result.values, there.reshape(len(result.values), -1).sum(axis=1)),
+            "direction": np.full(there.sum(), ramp.direction),
+            parameter: np.repeat(ramp.values, there.reshape(len(ramp.values), -1).sum(axis=1)),
             **{name: array[there] for name, array in arrays.items()},
         }
         for file, (arrays, there) in files.items()
@@ -150,25 +150,25 @@ class Ramps(ResultTuple):
 
 
 @as_json.register
-def _(result: Ramps) -> dict[str, Any]:
-    return result._asdict() | {"sweeps": [as_json(sweep) for sweep in result.sweeps]}
+def _(ramps: Ramps) -> dict[str, Any]:
+    return ramps._asdict() | {"sweeps": [as_json(sweep) for sweep in ramps.sweeps]}
 
 
 @sections.register
-def _(result: Ramps) -> list[Section]:
-    parts: list[Any] = [*result.sweeps]
-    if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in result.sweeps):
+def _(ramps: Ramps) -> list[Section]:
+    parts: list[Any] = [*ramps.sweeps]
+    if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in ramps.sweeps):
         parts.append(
-            f"irregular: nothing repeated within the {result.impacts_each} impacts at a value; with a high quality "
+            f"irregular: nothing repeated within the {ramps.impacts_each} impacts at a value; with a high quality "
             "factor the motion may still be settling (`impacts=...` gives it more)"
         )
     return [Section("", parts)]
 
 
 @csv_columns.register
-def _(result: Ramps) -> dict[str, dict[str, np.ndarray]]:
+def _(ramps: Ramps) -> CsvColumns:
     # the directions one below the other
-    each = [csv_columns(sweep, result.parameter) for sweep in result.sweeps]
+    each = [csv_columns(sweep, ramps.parameter) for sweep in ramps.sweeps]
     return {
         file: {name: np.concatenate([tables[file][name] for tables in each]) for name in columns}
         for file, columns in each[0].items()

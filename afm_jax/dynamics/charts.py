@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.checks import check_kind, checked
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -237,29 +237,29 @@ class StabilityChart(Result):
 
 
 @as_json.register
-def _(result: StabilityChart) -> dict[str, Any]:
-    verdicts, told = result.verdicts, {}
-    for axis, given in (("x", result.x), ("y", result.y)):
+def _(chart: StabilityChart) -> dict[str, Any]:
+    verdicts, told = chart.verdicts, {}
+    for axis, given in (("x", chart.x), ("y", chart.y)):
         if given is not None:
             told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
     told |= {
-        "orders": list(range(1, result.orders + 1)),
+        "orders": list(range(1, chart.orders + 1)),
         "points": verdicts.stable.shape[1],
         "admissible_share": verdicts.admissible.mean(axis=1),
         "stable_share": verdicts.stable.mean(axis=1),
-        "any_stable_share": result.stable_share,
+        "any_stable_share": chart.stable_share,
         "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
     }
     if verdicts.unresolved is not None:
         told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
-    if result.probability is not None:
-        told["uncertain_share"] = ((result.probability > 0.0) & (result.probability < 1.0)).mean(axis=1)
+    if chart.probability is not None:
+        told["uncertain_share"] = ((chart.probability > 0.0) & (chart.probability < 1.0)).mean(axis=1)
     return told
 
 
 @sections.register
-def _(result: StabilityChart) -> list[Section]:
-    told = as_json(result)
+def _(chart: StabilityChart) -> list[Section]:
+    told = as_json(chart)
     shares = zip(told["orders"], told["stable_share"], told["admissible_share"], strict=True)
     lines = [
         f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
@@ -270,13 +270,13 @@ def _(result: StabilityChart) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: StabilityChart) -> dict[str, dict[str, Any]]:
-    x, y = ("x" if result.x is None else result.x.path, "y" if result.y is None else result.y.path)
-    columns: dict[str, Any] = dict(zip((x, y), result.points(), strict=True))
-    columns["lowest_stable_order"] = result.lowest_stable_order.ravel()
+def _(chart: StabilityChart) -> CsvColumns:
+    x, y = ("x" if chart.x is None else chart.x.path, "y" if chart.y is None else chart.y.path)
+    columns: dict[str, Any] = dict(zip((x, y), chart.points(), strict=True))
+    columns["lowest_stable_order"] = chart.lowest_stable_order.ravel()
     names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
-    arrays = {name: getattr(result.verdicts, name) for name in names} | {"stable_probability": result.probability}
-    for order in range(result.orders):
+    arrays = {name: getattr(chart.verdicts, name) for name in names} | {"stable_probability": chart.probability}
+    for order in range(chart.orders):
         columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
     return {"chart.csv": columns}
 

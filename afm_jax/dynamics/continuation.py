@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
 from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
@@ -186,7 +186,7 @@ def _(result: Continuation) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Continuation) -> dict[str, dict[str, Any]]:
+def _(result: Continuation) -> CsvColumns:
     # points, their impacts if there are several, special points, and curves
     points, special = _point_rows(result), _special_rows(result)
     tables = {"branches.csv": columns_of(points, _POINT_COLUMNS)}

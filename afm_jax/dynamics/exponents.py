@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import multipliers_of
 from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, Record, Tips, follow, next_departures
@@ -127,7 +127,7 @@ def _(result: Lyapunov) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Lyapunov) -> dict[str, dict[str, Any]]:
+def _(result: Lyapunov) -> CsvColumns:
     motions = _motions(result)
     columns: dict[str, Any] = {} if result.along is None else {result.along.path: result.along.values}
     columns |= {

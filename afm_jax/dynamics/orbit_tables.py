@@ -7,7 +7,7 @@ one's numbers besides (`orbit_facts`).
 from typing import Any
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
 from afm_jax.impact.orbits import SingleImpactOrbits
@@ -74,19 +74,19 @@ class OrbitTable(ResultTuple):
 
 
 @as_json.register
-def _(result: OrbitTable) -> dict[str, Any]:
-    orbits = result.orbits
+def _(table: OrbitTable) -> dict[str, Any]:
+    orbits = table.orbits
     several = isinstance(orbits, ManyImpactOrbits)
-    more = {"impacts": result.impacts} if several else {"complete": orbits.complete}
-    return {"order": result.order, "orbits": result.rows} | more
+    more = {"impacts": table.impacts} if several else {"complete": orbits.complete}
+    return {"order": table.order, "orbits": table.rows} | more
 
 
 @sections.register
-def _(result: OrbitTable) -> list[Section]:
+def _(table: OrbitTable) -> list[Section]:
     # where base or force drive with what is read at the drive's frequency
-    rows, periods = result.rows, counted(result.order, "drive period")
-    if result.impacts is not None:
-        return [Section(f"Orbits with {counted(result.impacts, 'impact')} in {periods}", [_impacts_of(rows)])]
+    rows, periods = table.rows, counted(table.order, "drive period")
+    if table.impacts is not None:
+        return [Section(f"Orbits with {counted(table.impacts, 'impact')} in {periods}", [_impacts_of(rows)])]
     cells: dict[str, Cell] = {**_IMPACT_CELLS, "peak\nnm": "peak_amplitude_nm"}
     if rows and "drive_lockin_amplitude_nm" in rows[0]:
         cells |= {"at drive\nnm": "drive_lockin_amplitude_nm", "at drive\ndeg": "drive_lockin_phase_deg"}
@@ -116,14 +116,14 @@ def _impacts_of(orbits: list[dict[str, Any]]) -> Table:
 
 
 @csv_columns.register
-def _(result: OrbitTable) -> dict[str, dict[str, Any]]:
+def _(table: OrbitTable) -> CsvColumns:
     # a row an orbit; of several impacts also a row an impact
-    orbits = result.rows
-    if result.impacts is None:
-        return {"orbits.csv": columns_of(orbits, result.columns)}
+    orbits = table.rows
+    if table.impacts is None:
+        return {"orbits.csv": columns_of(orbits, table.columns)}
     impacts = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     return {
-        "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], result.columns),
+        "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], table.columns),
         "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
     }
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.apparatus.scene import drive_of
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.follow import LongRun
@@ -109,7 +109,7 @@ def _(result: MotionTable) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: MotionTable) -> dict[str, dict[str, Any]]:
+def _(result: MotionTable) -> CsvColumns:
     """Return a row a contact, and the tip, dense in contacts: of a short simulation as a whole, else over the window.
 
     The window is that of the observables.

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import WHY_REQUIRED
@@ -205,15 +205,15 @@ class EffectStudy(Result):
 
 
 @as_json.register
-def _(result: EffectStudy) -> dict[str, Any]:
-    reading, orbit, reduction = result.observed.reading, result.observed.orbit, result.reduction
+def _(study: EffectStudy) -> dict[str, Any]:
+    reading, orbit, reduction = study.observed.reading, study.observed.orbit, study.reduction
     assert reading is not None  # a study has one  # noqa: S101
     return {
         "compared": "last fifth of the duration" if orbit is None else "steady orbits",
         "full": {
             **reading._asdict(),
             "drive_periods": None if orbit is None else orbit.periods,
-            "time_us_per_period": result.cost,
+            "time_us_per_period": study.cost,
         },
         "effects": [
             {
@@ -224,9 +224,9 @@ def _(result: EffectStudy) -> dict[str, Any]:
                 "time_us_per_period": report.cost,
                 "needed": report.effect.name not in reduction.left_out,
             }
-            for report in result.effects
+            for report in study.effects
         ],
-        "accuracy": result.accuracy,
+        "accuracy": study.accuracy,
         "not_needed": list(reduction.left_out),
         "joint_change": reduction.change._asdict(),
         "reduced": {"time_us_per_period": reduction.cost},
@@ -234,8 +234,8 @@ def _(result: EffectStudy) -> dict[str, Any]:
 
 
 @sections.register
-def _(result: EffectStudy) -> list[Section]:
-    payload, reduction = as_json(result), result.reduction
+def _(study: EffectStudy) -> list[Section]:
+    payload, reduction = as_json(study), study.reduction
     full, joint = payload["full"], payload["joint_change"]
     cells: dict[str, Cell] = {
         "effect": "name",
@@ -252,10 +252,10 @@ def _(result: EffectStudy) -> list[Section]:
         f"{window if periods is None else counted(periods, 'drive period')}; "
         f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
         f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
-        f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(result.cost, '.4g')} us to compute "
+        f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(study.cost, '.4g')} us to compute "
         "a drive period."
     )
-    reasons = [f"{report.effect.name}: {report.reason}." for report in result.effects if report.reason is not None]
+    reasons = [f"{report.effect.name}: {report.reason}." for report in study.effects if report.reason is not None]
     conclusion = "every effect that can be left out is needed."
     if reduction.left_out:
         conclusion = (
@@ -264,13 +264,13 @@ def _(result: EffectStudy) -> list[Section]:
             f"{known(reduction.cost, '.4g')} us per drive period."
         )
     table = table_of(cells, payload["effects"], form=".3g")
-    end = f"For amplitudes to {100.0 * result.accuracy:g} % {conclusion}"
+    end = f"For amplitudes to {100.0 * study.accuracy:g} % {conclusion}"
     return [Section("", [summary, "Without the effect:", table, *reasons, end])]
 
 
 @csv_columns.register
-def _(result: EffectStudy) -> dict[str, dict[str, Any]]:
-    rows = as_json(result)["effects"]
+def _(study: EffectStudy) -> CsvColumns:
+    rows = as_json(study)["effects"]
     changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
     return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
 

@@ -21,7 +21,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import check_count, require_float64
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, squared_rebound_speed
 from afm_jax.impact.map import next_impact
@@ -61,7 +61,8 @@ class States(NamedTuple):
     order: Any
 
 
-class Check(NamedTuple):
+@dataclass(frozen=True)
+class Check:
     """One line of the verification."""
 
     equation: str
@@ -92,13 +93,7 @@ class Verification(Result):
 
 @as_json.register
 def _(result: Verification) -> dict[str, Any]:
-    return {
-        "checks": [check._asdict() for check in result.checks],
-        "passed": result.reason is None,
-        "tolerance": TOLERANCE,
-        "seed": result.seed,
-        "states": result.states,
-    }
+    return vars(result) | {"passed": result.reason is None, "tolerance": TOLERANCE}
 
 
 @sections.register
@@ -114,8 +109,8 @@ def _(result: Verification) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Verification) -> dict[str, dict[str, list[Any]]]:
-    return {"verify.csv": columns_of([check._asdict() for check in result.checks])}
+def _(result: Verification) -> CsvColumns:
+    return {"verify.csv": columns_of([vars(check) for check in result.checks])}
 
 
 def verify(*, states: int = 10_000, seed: int = 0) -> Verification:

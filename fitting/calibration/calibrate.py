@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
 from afm_jax.checks import check_parameter, checked
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.saved import as_json
@@ -100,37 +100,37 @@ class Calibration(JudgedResult):
 
 
 @as_json.register
-def _(result: Calibration) -> dict[str, Any]:
-    own = {name: value for name, value in vars(result).items() if name not in {"sweep", "fitted"}}
-    more = {"valid": result.valid, "instrument": result.sweep.instrument, "table_comments": result.table_comments}
+def _(lever: Calibration) -> dict[str, Any]:
+    own = {name: value for name, value in vars(lever).items() if name not in {"sweep", "fitted"}}
+    more = {"valid": lever.valid, "instrument": lever.sweep.instrument, "table_comments": lever.table_comments}
     return plain({"format": "afm-jax calibrate", "format_version": 2} | own | more)
 
 
 @csv_columns.register
-def _(result: Calibration) -> dict[str, dict[str, Any]]:
+def _(lever: Calibration) -> CsvColumns:
     # the scan and the fit
-    sweep = result.sweep
+    sweep = lever.sweep
     columns = {"frequency_khz": sweep.frequency_khz, "measured_amplitude": sweep.amplitude}
-    columns["fitted_amplitude"] = np.abs(result.fitted)
+    columns["fitted_amplitude"] = np.abs(lever.fitted)
     if sweep.phase_deg is not None:
         # the turns of the measured phase are kept
-        apart = np.angle(result.fitted * np.exp(-1j * np.deg2rad(sweep.phase_deg)), deg=True)
+        apart = np.angle(lever.fitted * np.exp(-1j * np.deg2rad(sweep.phase_deg)), deg=True)
         columns |= {"measured_phase_deg": sweep.phase_deg, "fitted_phase_deg": sweep.phase_deg + apart}
     return {"calibration_points.csv": columns}
 
 
 @sections.register
-def _(result: Calibration) -> list[Section]:
-    values = {"frequency_khz (kHz)": result.frequency_khz, "quality_factor": result.quality_factor}
-    values |= {f"spring constant, {name} (N/m)": one for name, one in result.spring_constant_n_per_m.items()}
+def _(lever: Calibration) -> list[Section]:
+    values = {"frequency_khz (kHz)": lever.frequency_khz, "quality_factor": lever.quality_factor}
+    values |= {f"spring constant, {name} (N/m)": one for name, one in lever.spring_constant_n_per_m.items()}
     cells: dict[str, Cell] = {
         "of the free cantilever": lambda row: row[0],
         "value +- standard error": lambda row: row[1].in_words,
     }
-    comments = result.table_comments
-    chi2 = f"chi2/dof {result.chi2:.1f}/{result.degrees_of_freedom}, errors: {result.error_origin}"
+    comments = lever.table_comments
+    chi2 = f"chi2/dof {lever.chi2:.1f}/{lever.degrees_of_freedom}, errors: {lever.error_origin}"
     return [
-        Section(f"{result.sweep.source}, {counted(result.sweep.points, 'point')}", []),
+        Section(f"{lever.sweep.source}, {counted(lever.sweep.points, 'point')}", []),
         Section("Values", [table_of(cells, [*values.items()]), chi2]),
         Section("Comments", ["\n".join(["For the top of an amplitude table:", *comments]) if comments else None]),
     ]

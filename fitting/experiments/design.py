@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import check_count, check_parameter, checked, in_float64
-from afm_jax.columns import csv_columns, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.report import Bullets, Section, Table, sections
 from afm_jax.results import JudgedResult, public_result
@@ -126,43 +126,43 @@ class Design(JudgedResult):
 
 
 @as_json.register
-def _(result: Design) -> dict[str, Any]:
+def _(plan: Design) -> dict[str, Any]:
     names = ("valid", "reasons", "warnings", "noise", "interest", "expected", "measured_so_far")
     return {
         "format": "afm-jax design",
         "format_version": 2,
-        "drive": result.prior.problem.drive,
-        "model": result.prior.problem.model,
-        **{name: getattr(result, name) for name in names},
-        "points": result.points(),
-        "candidates": int(result.candidates.usable.sum()),
-        "left_out": result.candidates.left_out,
-        "prior": {"source": result.prior.source, "rows_measured": len(result.prior.measured)},
+        "drive": plan.prior.problem.drive,
+        "model": plan.prior.problem.model,
+        **{name: getattr(plan, name) for name in names},
+        "points": plan.points(),
+        "candidates": int(plan.candidates.usable.sum()),
+        "left_out": plan.candidates.left_out,
+        "prior": {"source": plan.prior.source, "rows_measured": len(plan.prior.measured)},
     }
 
 
 @csv_columns.register
-def _(result: Design) -> dict[str, dict[str, Any]]:
-    return {"design.csv": result.columns}
+def _(plan: Design) -> CsvColumns:
+    return {"design.csv": plan.columns}
 
 
 @sections.register
-def _(result: Design) -> list[Section]:
-    columns, points, problem = result.columns, result.points(), result.prior.problem
+def _(plan: Design) -> list[Section]:
+    columns, points, problem = plan.columns, plan.points(), plan.prior.problem
     shown = {name: style for name, style in _SHOWN.items() if name in columns}
     table = {head: [f"{value:{form}}" for value in columns[name]] for name, (head, form) in shown.items()}
-    for name in result.interest[:4]:
+    for name in plan.interest[:4]:
         table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
     after = [
         f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
-        for name, entry in result.expected.items()
+        for name, entry in plan.expected.items()
     ]
-    usable, left_out = result.candidates.usable, result.candidates.left_out
-    title = f"{len(result.chosen)} points to measure next for {', '.join(result.interest)}"
+    usable, left_out = plan.candidates.usable, plan.candidates.left_out
+    title = f"{len(plan.chosen)} points to measure next for {', '.join(plan.interest)}"
     said = "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured"
     why = [f"{count} left out: {LEFT_OUT[name]}" for name, count in left_out.items()]
     return [
-        Section(f"{title} ({problem.model}, {result.prior.source})", []),
+        Section(f"{title} ({problem.model}, {plan.prior.source})", []),
         Section("Points", [Table("", [*table], [*zip(*table.values(), strict=True)]), said]),
         Section("Forecast", [f"After all: {', '.join(after)}"]),
         Section("Drives", [Bullets(why, f"{usable.sum()} of {usable.size} drives can be planned with.")]),

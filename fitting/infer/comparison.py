@@ -24,7 +24,7 @@ _EVEN, _PLAIN = 2.0, 10.0
 """Differences of AIC up to which models are even, and beyond which one is clearly favoured."""
 
 
-@public_result(picture="fitting.report.plots:models_figure", rows="rows", home="fitting.report.report")
+@public_result(picture="fitting.report.plots:models_figure", home="fitting.report.report")
 @dataclass(frozen=True)
 class Comparison(Result):
     """Models of one table, the best one first.

@@ -264,14 +264,12 @@ class FittedLaw(TabulatedLaw):
 
 
 @as_json.register
-def _(result: FittedLaw) -> dict[str, Any]:
+def _(law: FittedLaw) -> dict[str, Any]:
     # its points with units in their names, and all that makes it again
-    return as_json.dispatch(TabulatedLaw)(result) | {
-        name: plain(getattr(result, name)) for name in FittedLaw.__annotations__
-    }
+    return as_json.dispatch(TabulatedLaw)(law) | {name: plain(getattr(law, name)) for name in FittedLaw.__annotations__}
 
 
-@public_result(picture="fitting.report.plots:rows_figure", rows="parameters", home="fitting.report.report")
+@public_result(picture="fitting.report.plots:rows_figure", home="fitting.report.report")
 @dataclass(frozen=True)
 class FitResult(Result):
     """The outcome of `fit`; attributes are named like the keys of its JSON.
@@ -329,17 +327,17 @@ class FitResult(Result):
 
 @as_json.register
 @in_float64
-def _(result: FitResult) -> dict[str, Any]:
-    left_out = {"table"} if result.tables else {"table", "tables"}
-    names = [field.name for field in dataclasses.fields(result) if field.name not in left_out]
+def _(fit: FitResult) -> dict[str, Any]:
+    left_out = {"table"} if fit.tables else {"table", "tables"}
+    names = [field.name for field in dataclasses.fields(fit) if field.name not in left_out]
     return plain(
         {"format": FIT_FORMAT, "format_version": FIT_FORMAT_VERSION}
-        | {name: getattr(result, name) for name in names}
+        | {name: getattr(fit, name) for name in names}
         | {
-            "correlations": {"names": list(result.parameters), "matrix": result.correlations},
-            "law": as_json(result.law),
-            "input": result.table,
-            "repeats": repeats_of(result.table),
+            "correlations": {"names": list(fit.parameters), "matrix": fit.correlations},
+            "law": as_json(fit.law),
+            "input": fit.table,
+            "repeats": repeats_of(fit.table),
         }
     )
 

@@ -17,8 +17,6 @@ from jaxtyping import Bool, Float
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.results import JudgedResult, public_result
-from afm_jax.saved import as_json
-from afm_jax.strict_json import plain
 from afm_jax.words import printable
 from fitting.instruments.bins import binned, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
@@ -115,11 +113,6 @@ class MeasuredCurve(JudgedResult):
         """Return a known number, None where it is not known."""
         found = self.known.get(key)
         return None if found is None or isinstance(found.value, str) else found.value
-
-
-@as_json.register
-def _(result: MeasuredCurve) -> dict[str, Any]:
-    return plain(vars(result) | {"valid": result.valid})
 
 
 @checked

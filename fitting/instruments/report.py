@@ -8,6 +8,7 @@ import numpy as np
 from afm_jax.report import Bullets, Section, Table, sections
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.saved import as_json
+from afm_jax.strict_json import plain
 from afm_jax.whole_files import write_whole
 from fitting.instruments.curve import FORMAT_VERSION, MeasuredCurve, table_text
 
@@ -28,7 +29,7 @@ class CurvesOfFile(ResultTuple):
 
 @as_json.register
 def _(result: CurvesOfFile) -> dict[str, Any]:
-    first, curves = result.curves[0], [as_json(curve) for curve in result.curves]
+    first, curves = result.curves[0], [plain(as_json(curve)) for curve in result.curves]
     own = {"source": first.source, "instrument_format": first.format}
     return {"format": "afm-jax read", "format_version": FORMAT_VERSION, **own, "curves": curves}
 

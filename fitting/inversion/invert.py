@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked, in_float64
-from afm_jax.columns import csv_columns, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.saved import as_json
@@ -110,7 +110,7 @@ def _(result: Inversion) -> dict[str, Any]:
 
 
 @csv_columns.register
-def _(result: Inversion) -> dict[str, dict[str, Any]]:
+def _(result: Inversion) -> CsvColumns:
     drive = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     columns: dict[str, Any] = {name: getattr(result.table, name) for name in drive}
     found = {"approach_speed": "nm_per_us", "rebound_speed": "nm_per_us", "collision_delay": "us"}

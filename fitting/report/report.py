@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.columns import csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.report import Bullets, Picture, Section, Table, in_words, sections
 from afm_jax.words import counted, known, percent
 from fitting.infer.comparison import Comparison
@@ -104,6 +104,11 @@ def _(result: Comparison) -> list[Section]:
     return [Section("Comparison", [said, Table("Models", head, rows), f"  {result.verdict}"])]
 
 
+@csv_columns.register
+def _(result: Comparison) -> CsvColumns:
+    return {"models.csv": columns_of(result.rows)}
+
+
 @sections.register
 def _(result: Posterior) -> list[Section]:
     rows = [
@@ -119,7 +124,7 @@ def _(result: Posterior) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: FitResult) -> dict[str, dict[str, Any]]:
+def _(result: FitResult) -> CsvColumns:
     """Return what was set, measured and predicted in each row of the table, and whether it was used."""
     table, rows = result.table, result.rows
     columns: dict[str, Any] = {

@@ -586,14 +586,14 @@ class EnergyCurve:
 
 
 @as_json.register
-def _(result: EnergyCurve) -> dict[str, Any]:
+def _(curve: EnergyCurve) -> dict[str, Any]:
     # what is said of each point stands beside its band
     names = ("amplitude_ratio", "height_nm", "energy_aj", "energy_low_aj", "energy_high_aj", "virial_aj")
-    half = TWO_SIDED_95 * result.virial_error_aj
-    return {name: getattr(result, name) for name in names} | {
-        "said": [said_of(*ends) for ends in zip(result.energy_low_aj, result.energy_high_aj, strict=True)],
-        "virial_low_aj": result.virial_aj - half,
-        "virial_high_aj": result.virial_aj + half,
+    half = TWO_SIDED_95 * curve.virial_error_aj
+    return {name: getattr(curve, name) for name in names} | {
+        "said": [said_of(*ends) for ends in zip(curve.energy_low_aj, curve.energy_high_aj, strict=True)],
+        "virial_low_aj": curve.virial_aj - half,
+        "virial_high_aj": curve.virial_aj + half,
     }
 
 

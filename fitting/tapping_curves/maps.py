@@ -105,19 +105,19 @@ class TappingMap(JudgedResult):
 
 
 @as_json.register
-def _(result: TappingMap) -> dict[str, Any]:
+def _(image: TappingMap) -> dict[str, Any]:
     # all but the arrays, and of these the median and the ends of 95 % of the pixels in range
-    used = result.state == PixelState.USED
+    used = image.state == PixelState.USED
     ends = {"percentile_2_5": 2.5, "median": 50.0, "percentile_97_5": 97.5}
     arrays = {
-        name: {end: np.percentile(getattr(result, name)[used], p) if used.any() else None for end, p in ends.items()}
+        name: {end: np.percentile(getattr(image, name)[used], p) if used.any() else None for end, p in ends.items()}
         for name in ARRAYS
     }
-    own = {name: value for name, value in vars(result).items() if name not in {*ARRAYS, "state"}}
-    pixels = {"rows": used.shape[0], "columns": used.shape[1], **result.counts}
-    known = {key: vars(one) for key, one in result.known.items()}
+    own = {name: value for name, value in vars(image).items() if name not in {*ARRAYS, "state"}}
+    pixels = {"rows": used.shape[0], "columns": used.shape[1], **image.counts}
+    known = {key: vars(one) for key, one in image.known.items()}
     head = {"format": "afm-jax tapping-map", "format_version": 1}
-    return plain(head | own | arrays | {"valid": result.valid, "pixels": pixels, "known": known})
+    return plain(head | own | arrays | {"valid": image.valid, "pixels": pixels, "known": known})
 
 
 @checked

@@ -1,11 +1,10 @@
 """A tapping curve, and several of one lever, as a person reads them."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from afm_jax.columns import columns_of, csv_columns
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.report import Bullets, Picture, Section, Table, sections
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from afm_jax.words import interval, percent, with_error
@@ -44,7 +43,7 @@ def _(result: Tapping) -> list[Section]:
 
 
 @csv_columns.register
-def _(result: Tapping) -> dict[str, dict[str, Any]]:
+def _(result: Tapping) -> CsvColumns:
     return {"tapping_rows.csv": columns_of(result.in_unit(result.records()))}
 
 
@@ -174,6 +173,12 @@ def _speeds(result: Tapping) -> Section:
             known = f"known to {percent(float(np.median(error / u)))} in the median"
             words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
     return Section("Speeds of the impacts", [words])
+
+
+@csv_columns.register
+def _(result: TappingTogether) -> CsvColumns:
+    each = result.curves
+    return {"together.csv": {"curve": [one.table.source for one in each], "valid": [one.valid for one in each]}}
 
 
 @sections.register

@@ -269,24 +269,24 @@ class Tapping(JudgedResult):
 
 
 @as_json.register
-def _(result: Tapping) -> dict[str, Any]:
-    energy, law = result.energy, None if result.law is None else as_json(result.law)
+def _(taps: Tapping) -> dict[str, Any]:
+    energy, law = taps.energy, None if taps.law is None else as_json(taps.law)
     payload = plain(
         {
             "format": "afm-jax tapping",
             "format_version": 1,
-            "valid": result.valid,
-            "reasons": result.reasons,
-            "warnings": result.warnings,
+            "valid": taps.valid,
+            "reasons": taps.reasons,
+            "warnings": taps.warnings,
             "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
             "energy_per_tap_reason": energy["reason"] or None,
-            "largest_energy_aj": result.largest,
-            "energies_at": result.energies_at,
-            "way_differences": differences_of_ways(result.functions),
-            "epsilon_nm2_per_us2": result.epsilon,
-            "assumptions": result.assumptions,
-            "phase_sense": {**result.curve.phase._asdict(), "assumed": result.curve.phase.assumed},
-            "assumed_errors": {name: USUAL_ERRORS[name] for name in result.curve.assumed},
+            "largest_energy_aj": taps.largest,
+            "energies_at": taps.energies_at,
+            "way_differences": differences_of_ways(taps.functions),
+            "epsilon_nm2_per_us2": taps.epsilon,
+            "assumptions": taps.assumptions,
+            "phase_sense": {**taps.curve.phase._asdict(), "assumed": taps.curve.phase.assumed},
+            "assumed_errors": {name: USUAL_ERRORS[name] for name in taps.curve.assumed},
             "branches": [
                 {
                     "drive_frequency_khz": branch.drive_frequency_khz,
@@ -294,49 +294,49 @@ def _(result: Tapping) -> dict[str, Any]:
                     "branch": branch.way,
                     "repulsive": branch.repulsive,
                     "rows": len(branch.rows),
-                    **_constant_of(result, branch),
+                    **_constant_of(taps, branch),
                     "curve": as_json(branch.curve),
                 }
-                for branch in result.branches
+                for branch in taps.branches
             ],
-            **_fits(result),
-            "hysteresis": [{**vars(one), "width_nm": one.width_nm} for one in result.hysteresis],
+            **_fits(taps),
+            "hysteresis": [{**vars(one), "width_nm": one.width_nm} for one in taps.hysteresis],
             "law": None if law is None else law["law"],
-            "reason": result.reason,
+            "reason": taps.reason,
             "fit": law,
-            "rows": result.records(),
-            "set_aside": result.set_aside,
-            "versions": result.versions,
-            "input": {name: value for name, value in vars(result.table).items() if value is not None},
+            "rows": taps.records(),
+            "set_aside": taps.set_aside,
+            "versions": taps.versions,
+            "input": {name: value for name, value in vars(taps.table).items() if value is not None},
         }
     )
-    if not result.curve.over_spring_constant:
+    if not taps.curve.over_spring_constant:
         return payload
     why = "the spring constant is not known: energies are over it, in nm^2"
-    return {**result.in_unit(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
+    return {**taps.in_unit(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
 
 
-def _constant_of(result: Tapping, branch: TappingBranch) -> dict[str, Any]:
+def _constant_of(taps: Tapping, branch: TappingBranch) -> dict[str, Any]:
     """Return whether one energy explains the rows of a branch, and which."""
-    groups = () if result.fit is None or result.why_not_constant else result.fit.groups
+    groups = () if taps.fit is None or taps.why_not_constant else taps.fit.groups
     one = next((one for one in groups if (one.drive, one.repulsive) == (branch.drive, branch.repulsive)), None)
     found = (None, None, None) if one is None else (one.energy_aj, one.error_aj, one.interval95_aj)
     names = ("energy_aj", "standard_error_aj", "interval95_aj")
     return {"constant": one is not None, **dict(zip(names, found, strict=True))}
 
 
-def _fits(result: Tapping) -> dict[str, Any]:
+def _fits(taps: Tapping) -> dict[str, Any]:
     """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
-    fit, functions = result.fit, result.functions
+    fit, functions = taps.fit, taps.functions
     smooth = {name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")}
-    smooth |= {"valid": not result.why_not_functions, "reason": result.why_not_functions or None}
+    smooth |= {"valid": not taps.why_not_functions, "reason": taps.why_not_functions or None}
     smooth |= {"nuisances": nuisances_as_dict(functions.nuisances)}
     names = ("chi2", "degrees_of_freedom", "p_value")
     return {
         "functions": smooth if functions.branches else None,
         **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
         "scale": None if fit is None else fit.scale,
-        "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and not result.why_not_constant else {},
+        "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and not taps.why_not_constant else {},
     }
 
 

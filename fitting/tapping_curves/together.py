@@ -51,7 +51,6 @@ class CurveScatter(CurveBranch):
 
 @public_result(
     picture="fitting.tapping_curves.pictures:together_figure",
-    rows="rows",
     home="fitting.tapping_curves.report",
     whole=False,
 )
@@ -82,11 +81,6 @@ class TappingTogether(JudgedResult):
         if self.lever is None or not self.lever.minimum.degrees_of_freedom:
             return None
         return self.lever.minimum.p_value
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """A row a curve: its table, and whether its energy is measured."""
-        return [{"curve": one.table.source, "valid": one.valid} for one in self.curves]
 
     @property
     def reasons(self) -> list[str]:

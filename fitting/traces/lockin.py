@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import check_parameter, checked
-from afm_jax.columns import csv_columns, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, ResultTuple, public_result
 from afm_jax.saved import as_json
@@ -95,29 +95,29 @@ class LockinResult(JudgedResult):
 
 
 @as_json.register
-def _(result: LockinResult) -> dict[str, Any]:
-    return {"format": "afm-jax lockin", "format_version": 2, "valid": result.valid} | vars(result)
+def _(read: LockinResult) -> dict[str, Any]:
+    return {"format": "afm-jax lockin", "format_version": 2, "valid": read.valid} | vars(read)
 
 
 @csv_columns.register
-def _(result: LockinResult) -> dict[str, dict[str, Any]]:
+def _(read: LockinResult) -> CsvColumns:
     names = ("orders", "amplitudes_nm", "amplitude_errors_nm", "phases_deg")
     columns = ("order", "lockin_amplitude_nm", "lockin_amplitude_error_nm", "phase_deg")
-    return {"lockin.csv": {column: getattr(result, name) for column, name in zip(columns, names, strict=True)}}
+    return {"lockin.csv": {column: getattr(read, name) for column, name in zip(columns, names, strict=True)}}
 
 
 @sections.register
-def _(result: LockinResult) -> list[Section]:
+def _(read: LockinResult) -> list[Section]:
     cells: dict[str, Cell] = {
         "drive /": "order:d",
         "amplitude\nnm": "lockin_amplitude_nm",
         "+-": "lockin_amplitude_error_nm:.2g",
         "phase\ndegrees": "phase_deg:.2f",
     }
-    title = f"Order {result.order} of {result.drive_frequency_khz:g} kHz, {result.response_periods} periods"
+    title = f"Order {read.order} of {read.drive_frequency_khz:g} kHz, {read.response_periods} periods"
     return [
         Section(title, []),
-        Section("Amplitudes", [table_of(cells, rows_of(csv_columns(result)["lockin.csv"]))]),
+        Section("Amplitudes", [table_of(cells, rows_of(csv_columns(read)["lockin.csv"]))]),
     ]
 
 
