@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from afm_jax.checks import is_array
 from afm_jax.saved import fields_of, is_abstract, is_record
 from afm_jax.words import is_words, known, text_table
 
-T = TypeVar("T")
 Cell = str | Callable[[Any], Any]
 """The key of a row, with a format behind a colon if its numbers are not to have the table's, or a function of a row."""
 
@@ -137,7 +136,9 @@ def text_of(*results: Any) -> str:
     first, *others = _sections_of(results)
     blocks = [lines_of(first.title, *first.parts), lines_of(*_verdict(results[0]))]
     blocks += [lines_of(*section.parts) for section in others if not section.page_only]
-    return _in_unit(results[0], "\n\n".join("\n".join(block) for block in blocks if block))
+    # energies have a unit of their own where no spring constant is known
+    in_unit = getattr(results[0], "in_unit", str)
+    return in_unit("\n\n".join("\n".join(block) for block in blocks if block))
 
 
 def lines_of(*parts: Any) -> list[str]:
@@ -184,7 +185,7 @@ def page_of(*results: Any, drawn: Mapping[str, str] | None = None, template: str
         sections=[(name, parts) for name, parts in held if parts],
         drawn=drawn,
     )
-    return _in_unit(results[0], page)
+    return getattr(results[0], "in_unit", str)(page)
 
 
 def _is_shown(part: Any, drawn: Mapping[str, str]) -> bool:
@@ -204,7 +205,7 @@ def _sections_of(results: Sequence[Any]) -> list[Section]:
     return shown
 
 
-def at_home(result: T) -> T:
+def at_home(result: Any) -> Any:
     """Return a result after the module has been imported that registers how it is shown."""
     if getattr(result, "_home", ""):
         importlib.import_module(getattr(result, "_home", ""))
@@ -215,11 +216,6 @@ def _verdict(result: Any) -> list[Any]:
     if not hasattr(result, "valid"):
         return []
     return ["VALID" if result.valid else "NOT VALID: do not use the numbers below.", Bullets(result.reasons)]
-
-
-def _in_unit(result: Any, said: str) -> str:
-    """Return what is said of a result in the unit that its energies have."""
-    return getattr(result, "in_unit", str)(said)
 
 
 _NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))

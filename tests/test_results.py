@@ -33,6 +33,7 @@ from afm_jax.studies.effects import EffectStudy
 from fitting.infer.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
 from tests.fresh_python import python
+from tests.html_pages import read_page
 from tests.lockin_traces import noisy_bounce
 from tests.strict_reading import strictly
 
@@ -291,15 +292,16 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW
     for record in computed:
-        path = tmp_path / f"{type(record).__name__}.json"
-        record.save(path)
-        again = fitting.load(path)
-        assert parts_of(again) == parts_of(record), path.stem
+        files = {path.suffix: path for path in record.report(tmp_path / type(record).__name__, "it")}
+        again = fitting.load(files[".json"])
+        assert parts_of(again) == parts_of(record), files
         assert repr(again) == repr(record).replace("a function", "none")
-        record.plot(path.with_suffix(".png"))
-        assert path.with_suffix(".png").stat().st_size > 5000
+        assert files[".png"].stat().st_size > 5000
+        assert str(record) in files[".txt"].read_text()
+        assert any("svg+xml" in each.attrib["src"] for each in read_page(files[".html"].read_text()).iter("img"))
         assert len(record.to_pandas())
-    payload = json.loads((tmp_path / "FitResult.json").read_text())
+        assert len(files[".csv"].read_text().splitlines()) > 1
+    payload = json.loads((tmp_path / "FitResult" / "it.json").read_text())
     assert payload["parameters"]["r"]["value"] == fitted.parameters["r"].value
 
 

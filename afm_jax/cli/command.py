@@ -244,12 +244,10 @@ def hand_out(session: Session, output: Output) -> None:
         NotValid: if the result says that it is not valid.
     """
     if session.out is not None:
+        writers = {output.json_file: partial(write_json, payload=output.payload)} if output.json_file else {}
         for name, columns in output.tables.items():
             session.write_columns(name, columns)
-        writers = dict(output.files)
-        if output.json_file:
-            writers[output.json_file] = partial(write_json, payload=output.payload)
-        for name, write in writers.items():
+        for name, write in (writers | output.files).items():
             write(session.out / name)
             session.note(f"wrote {session.out / name}")
         for path in () if output.report is None else output.report(session.out):

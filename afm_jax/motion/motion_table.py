@@ -12,7 +12,7 @@ from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.follow import LongRun
 from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
-from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
+from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, known_columns, public_result
@@ -76,11 +76,8 @@ def _(result: MotionTable) -> dict[str, Any]:
         "deflection_harmonics": deflection and [harmonic._asdict() for harmonic in deflection],
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
         "null_reasons": reasons,
-        "start": {name: float(value) for name, value in simulation.start._asdict().items()},
-        "final": {
-            **{name: float(value) for name, value in simulation.final._asdict().items()},
-            "phase": ContactPhase(int(simulation.phase)).name.lower(),
-        },
+        "start": simulation.start._asdict(),
+        "final": simulation.final._asdict() | {"phase": ContactPhase(int(simulation.phase)).name.lower()},
         "outcome": MotionOutcome(int(simulation.outcome)).sentence,
         "valid": result.reason is None,
         "settings": dict(result.settings),
@@ -123,7 +120,13 @@ def _(result: MotionTable) -> CsvColumns:
     inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]
     tip = result.dense.at(np.union1d(np.linspace(begin, end, _POINTS), inner))._asdict()
     tip["phase"] = [ContactPhase(phase).name.lower() for phase in tip["phase"].tolist()]
-    return {"contacts.csv": _contact_columns(simulation), "trajectory.csv": tip}
+    contacts = {
+        name.removeprefix("contacts_").removeprefix("detail_"): column[: int(simulation.count)].tolist()
+        for name, (column, _) in known_columns(simulation).items()
+        if name.startswith("contacts_")
+    }
+    contacts["kind"] = [ContactKind(kind).name.lower() for kind in contacts["kind"]]
+    return {"contacts.csv": contacts, "trajectory.csv": tip}
 
 
 def _frequency(seen: Observables, multiple: int) -> str:
@@ -171,13 +174,3 @@ def _over_a_response(seen: Observables) -> list[str]:
         f"{seen.dissipated_in_air_aj:.5g} lost in air, {seen.dissipated_in_contact_aj:.5g} in the sample."
     )
     return lines
-
-
-def _contact_columns(simulation: Simulation) -> dict[str, list[Any]]:
-    """Return the columns of all contacts; times of what did not happen are NaN."""
-    columns = {
-        name.removeprefix("contacts_").removeprefix("detail_"): column[: int(simulation.count)].tolist()
-        for name, (column, _) in known_columns(simulation).items()
-        if name.startswith("contacts_")
-    }
-    return columns | {"kind": [ContactKind(kind).name.lower() for kind in columns["kind"]]}
