@@ -173,16 +173,16 @@ def page_of(*results: Any, drawn: Mapping[str, str] | None = None, template: str
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, finalize=_allowed, undefined=StrictUndefined
     )
     environment.filters["signed"] = signed
-    first, *others = _sections_of(results)
-    title, drawn = (first.title or type(results[0]).__name__).rstrip(":"), drawn or {}
+    shown, drawn = _sections_of(results), drawn or {}
+    title = (shown[0].title or type(results[0]).__name__).rstrip(":")
     if not pictures_of(*results):
-        others.append(Section("Picture", [Picture(function, title) for function in drawn]))
-    held = [(each.title, [part for part in each.parts if _is_shown(part, drawn)]) for each in others]
+        shown.append(Section("Picture", [Picture(function, title) for function in drawn]))
+    (_, lead), *others = ((each.title, [part for part in each.parts if _is_shown(part, drawn)]) for each in shown)
     page = environment.get_template(template).render(
         title=title,
         verdict=_verdict(results[0]),
-        lead=first.parts,
-        sections=[(name, parts) for name, parts in held if parts],
+        lead=lead,
+        sections=[(name, parts) for name, parts in others if parts],
         drawn=drawn,
     )
     return getattr(results[0], "in_unit", str)(page)

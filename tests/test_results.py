@@ -280,6 +280,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     prior = fitting.prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0)
     size = {"orders": (1,), "amplitudes_nm": (2.0, 4.0), "offsets_nm": (0.0,), "detunings": (0.98, 1.0)}
     fitted: Any = example_fit()
+    row = {"model": "law", "chi2": 5.0, "degrees_of_freedom": 6, "valid": True}
     computed: list[Any] = [
         afm.single_impact_orbits(scene, 1),
         afm.stability_chart(plane, x_values=np.array([0.9, 1.0, 1.01]), y_values=np.array([3.0, 4.0]), last_order=1),
@@ -287,7 +288,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         fitted,
         fitting.invert(fitting.read_table(EXAMPLE)),
         fitting.design(prior, fitting.drive_grid(**size, free_frequency_khz=90.0), points=2),
-        Comparison([{"model": "law"}], "one only", {"law": fitted}),
+        Comparison([row | {"aic": 9.0, "delta_aic": 0.0}], "one only", {"law": fitted}),
         fitting.lockin(*noisy_bounce(1)[:2], 181.8, 1),
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW

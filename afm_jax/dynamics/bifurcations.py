@@ -156,7 +156,7 @@ def _(ramps: Ramps) -> dict[str, Any]:
 
 @sections.register
 def _(ramps: Ramps) -> list[Section]:
-    parts: list[Any] = [*ramps.sweeps]
+    parts = [part for ramp in ramps.sweeps for part in sections(ramp)[0].parts]
     if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in ramps.sweeps):
         parts.append(
             f"irregular: nothing repeated within the {ramps.impacts_each} impacts at a value; with a high quality "
