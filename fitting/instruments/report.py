@@ -28,8 +28,8 @@ class CurvesOfFile(ResultTuple):
 
 
 @as_json.register
-def _(result: CurvesOfFile) -> dict[str, Any]:
-    first, curves = result.curves[0], [plain(as_json(curve)) for curve in result.curves]
+def _(read: CurvesOfFile) -> dict[str, Any]:
+    first, curves = read.curves[0], [plain(as_json(curve)) for curve in read.curves]
     own = {"source": first.source, "instrument_format": first.format}
     return {"format": "afm-jax read", "format_version": FORMAT_VERSION, **own, "curves": curves}
 
@@ -40,9 +40,9 @@ def _(result: MeasuredCurve) -> list[Section]:
 
 
 @sections.register
-def _(result: CurvesOfFile) -> list[Section]:
+def _(read: CurvesOfFile) -> list[Section]:
     # the curves, what is known and from where, what is missing, what was assumed
-    curves = result.curves
+    curves = read.curves
     first = curves[0]
     known = {key: one for key, one in first.known.items() if key not in _OWN}
     values = [one.value if isinstance(one.value, str) else f"{one.value:.7g}" for one in known.values()]

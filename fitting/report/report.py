@@ -25,21 +25,21 @@ from fitting.tables.several import SeveralTables
 
 
 @sections.register
-def _(result: FitResult) -> list[Section]:
-    cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
-    parting = parting_in_words(result) if result.valid else ""
-    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
-    chi2 = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
+def _(fit: FitResult) -> list[Section]:
+    cells = [_parameter_cells(name, parameter) for name, parameter in fit.parameters.items()]
+    parting = parting_in_words(fit) if fit.valid else ""
+    probability = f", probability {fit.p_value:.2g}" if np.isfinite(fit.p_value) else ""
+    chi2 = f"chi2/dof = {fit.chi2:.1f}/{fit.degrees_of_freedom}{probability}"
     # where impacts last chi2 makes up for what a formula lacks
-    chi2 += "" if has_delay(result) else f", AIC {result.aic:.1f}"
-    title = f"Impact law of {result.table.source} ({counted(result.table.rows, 'row')}), model {result.model}:"
+    chi2 += "" if has_delay(fit) else f", AIC {fit.aic:.1f}"
+    title = f"Impact law of {fit.table.source} ({counted(fit.table.rows, 'row')}), model {fit.model}:"
     return [
-        Section(title, [f"  {line}" for line in (*formulas(result), held_in_words(result)) if line]),
+        Section(title, [f"  {line}" for line in (*formulas(fit), held_in_words(fit)) if line]),
         Section("Pictures", [Picture(f"fitting.report.plots:{name}", words) for name, words in _PICTURES.items()]),
         Section("Parameters", [Table("Fitted parameters", _PARAMETER_HEAD, cells)]),
-        Section("Goodness of fit", [f"  {line}" for line in (band_in_words(result), parting, chi2) if line]),
-        *_table_sections(result),
-        Section("Inputs", _inputs(result), page_only=True),
+        Section("Goodness of fit", [f"  {line}" for line in (band_in_words(fit), parting, chi2) if line]),
+        *_table_sections(fit),
+        Section("Inputs", _inputs(fit), page_only=True),
     ]
 
 
@@ -55,10 +55,10 @@ _PICTURES = {
 }
 
 
-def _inputs(result: FitResult) -> list[Any]:
+def _inputs(fit: FitResult) -> list[Any]:
     """Return the remarks of the tables, the options of the fit, and what computed it."""
-    parts: list[Any] = [Bullets([remark for table in result.table.tables for remark in table.remarks])]
-    named = (("Options of the fit", "option", result.settings), ("What computed it", "package", result.versions))
+    parts: list[Any] = [Bullets([remark for table in fit.table.tables for remark in table.remarks])]
+    named = (("Options of the fit", "option", fit.settings), ("What computed it", "package", fit.versions))
     for caption, name, values in named:
         rows = [[key, value if isinstance(value, str) else in_words(value)] for key, value in values.items()]
         parts.append(Table(caption, [name, "value"], rows))
@@ -71,15 +71,15 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
     return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
 
 
-def _table_sections(result: FitResult) -> list[Section]:
+def _table_sections(fit: FitResult) -> list[Section]:
     """Return each of several tables' pull, what it has to itself, and the energy lost in an impact."""
     pulls, own = [], []
-    for one in result.tables:
+    for one in fit.tables:
         pulls.append([one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")])
         own += [[one.name, *_parameter_cells(name, parameter)] for name, parameter in one.nuisances.items()]
     head = ["table", "its nuisance", "value", "std. error", "95 % interval"]
     table = Table("Tables", ["table", "rows used", "chi2/readings", "pull"], pulls)
-    losses = losses_in_words(result) if result.valid else []
+    losses = losses_in_words(fit) if fit.valid else []
     return [
         Section("Tables", [table, PULLS if pulls else None]),
         Section("Nuisances", [Table("Of each table", head, own)]),
@@ -110,23 +110,23 @@ def _(result: Comparison) -> CsvColumns:
 
 
 @sections.register
-def _(result: Posterior) -> list[Section]:
+def _(drawn: Posterior) -> list[Section]:
     rows = [
-        [name, f"{result.mean[name]:.6g}", *(f"{end:.6g}" for end in ends)] for name, ends in result.interval95.items()
+        [name, f"{drawn.mean[name]:.6g}", *(f"{end:.6g}" for end in ends)] for name, ends in drawn.interval95.items()
     ]
     head = ["parameter", "mean", "from", "to"]
     said = "95 % credible intervals (posterior, flat priors):"
-    if result.method == "gaussian":
-        worth = f"weighted to chi2, {result.chains.effective_samples[0]:.0f} of 120 are effective"
+    if drawn.method == "gaussian":
+        worth = f"weighted to chi2, {drawn.chains.effective_samples[0]:.0f} of 120 are effective"
         said = f"95 % intervals of samples of the Gaussian around the fit ({worth}):"
-    wrong = [f"Not converged: {reason}" for reason in result.reasons]
+    wrong = [f"Not converged: {reason}" for reason in drawn.reasons]
     return [Section("Posterior", [said, Table("By parameter", head, rows), Bullets(wrong)])]
 
 
 @csv_columns.register
-def _(result: FitResult) -> CsvColumns:
+def _(fit: FitResult) -> CsvColumns:
     """Return what was set, measured and predicted in each row of the table, and whether it was used."""
-    table, rows = result.table, result.rows
+    table, rows = fit.table, fit.rows
     columns: dict[str, Any] = {
         "line": table.lines,
         "order": table.order,

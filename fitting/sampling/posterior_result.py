@@ -72,20 +72,20 @@ class Posterior(Result):
 
 
 @as_json.register
-def _(result: Posterior) -> dict[str, Any]:
+def _(drawn: Posterior) -> dict[str, Any]:
     # without the single samples
-    chains, kinds = result.chains, ("mean", "standard_deviation", "interval95")
+    chains, kinds = drawn.chains, ("mean", "standard_deviation", "interval95")
     diagnostics = {
-        name: dict(zip(result.mean, plain(getattr(chains, name)), strict=True))
+        name: dict(zip(drawn.mean, plain(getattr(chains, name)), strict=True))
         for name in ("r_hat", "effective_samples")
     }
     count, draws, _ = chains.samples.shape
     sizes = {"chains": count, "draws": draws, "seed": chains.seed, "divergences": chains.divergences}
     return {
-        "method": result.method,
-        "converged": result.converged,
-        "reasons": result.reasons,
-        "parameters": {name: {kind: getattr(result, kind)[name] for kind in kinds} for name in result.mean},
+        "method": drawn.method,
+        "converged": drawn.converged,
+        "reasons": drawn.reasons,
+        "parameters": {name: {kind: getattr(drawn, kind)[name] for kind in kinds} for name in drawn.mean},
         "chains": sizes | diagnostics,
     }
 

@@ -101,19 +101,19 @@ class TappingTogether(JudgedResult):
 
 
 @as_json.register
-def _(result: TappingTogether) -> dict[str, Any]:
+def _(whole: TappingTogether) -> dict[str, Any]:
     # each curve's own is in `curves`
     told = {
         "format": "afm-jax tapping together",
         "format_version": 1,
-        "valid": result.valid,
-        "reasons": result.reasons,
-        "curves": [one.table.source for one in result.curves],
-        "common_nuisances": nuisances_as_dict(result.common_nuisances),
-        "agreement_p_value": result.agreement_p_value,
-        "branches": [{**vars(one), "branch": one.way} for one in result.scatter],
+        "valid": whole.valid,
+        "reasons": whole.reasons,
+        "curves": [one.table.source for one in whole.curves],
+        "common_nuisances": nuisances_as_dict(whole.common_nuisances),
+        "agreement_p_value": whole.agreement_p_value,
+        "branches": [{**vars(one), "branch": one.way} for one in whole.scatter],
     }
-    return result.in_unit(plain(told))
+    return whole.in_unit(plain(told))
 
 
 @checked
