@@ -247,7 +247,7 @@ def hand_out(session: Session, output: Output) -> None:
         writers = {output.json_file: partial(write_json, payload=output.payload)} if output.json_file else {}
         for name, columns in output.tables.items():
             session.write_columns(name, columns)
-        for name, write in (writers | output.files).items():
+        for name, write in {**writers, **output.files}.items():
             write(session.out / name)
             session.note(f"wrote {session.out / name}")
         for path in () if output.report is None else output.report(session.out):
