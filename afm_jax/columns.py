@@ -1,13 +1,20 @@
-"""Rows of a result as columns of a CSV file, and as a table to print."""
+"""The columns of a result, as CSV files and as rows."""
 
+import csv
+import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from functools import singledispatch
+from typing import Any
 
-from afm_jax.words import known
+CsvColumns = Mapping[str, Mapping[str, Any]]
+"""Columns by their names, of each file by its name."""
 
-if TYPE_CHECKING:
-    from rich.table import Table
+
+@singledispatch
+def csv_columns(result: Any) -> CsvColumns:  # noqa: ARG001 (kinds of results register theirs)
+    """Return the columns, by their names, of each CSV file of a result, by the file's name."""
+    return {}
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], names: Iterable[str] | None = None) -> dict[str, list[Any]]:
@@ -22,9 +29,20 @@ def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
 
 
-def csv_cells(column: Any) -> Iterable[Any]:
-    """Return the cells of a column: numbers with all their digits, true and false in words, the unknown empty."""
-    return (_csv_cell(_plain(value)) for value in _plain(column))
+def csv_text(columns: Mapping[str, Any], comments: Iterable[str] = ()) -> str:
+    """Return a CSV file: numbers with all their digits, true and false in words, empty what is None or not finite.
+
+    Args:
+        columns: lists or arrays of one length, in order.
+        comments: lines above the table, each after a number sign.
+    """
+    text = io.StringIO()
+    text.writelines(f"# {comment}\n" for comment in comments)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    cells = ([_csv_cell(_plain(value)) for value in _plain(column)] for column in columns.values())
+    writer.writerows(zip(*cells, strict=True))
+    return text.getvalue()
 
 
 def _csv_cell(value: Any) -> Any:
@@ -35,40 +53,3 @@ def _csv_cell(value: Any) -> Any:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
-
-
-Cell = str | Callable[[Any], Any]
-"""The key of a row, with a format behind a colon if its numbers are not to have the table's, or a function of a row."""
-
-
-def printed_table(title: str, cells: Mapping[str, Cell], rows: Sequence[Any], *, form: str = ".6g") -> "Table":
-    """Return a table to print, a row a line: what is unknown is a dash, columns of words are set to the left.
-
-    Args:
-        title: what stands above the table; may be empty.
-        cells: of each heading, which may have its unit in a second line, what stands below it.
-        rows: mappings or records of numbers, words and truths.
-        form: format of the numbers.
-    """
-    from rich.table import Table  # noqa: PLC0415 (help is there without it)
-
-    columns = {heading: [_printed(row, cell, form) for row in rows] for heading, cell in cells.items()}
-    table = Table(title=title or None, title_justify="left")
-    for heading, texts in columns.items():
-        words = any(text[:1].isalpha() for text in texts)
-        table.add_column(heading, justify="left" if words else "right")
-    for texts in zip(*columns.values(), strict=True):
-        table.add_row(*texts)
-    return table
-
-
-def _printed(row: Any, cell: Cell, form: str) -> str:
-    if callable(cell):
-        value = cell(row)
-    else:
-        key, _, own = cell.partition(":")
-        value, form = row.get(key) if isinstance(row, Mapping) else getattr(row, key), own or form
-    value = _plain(value)
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return value if isinstance(value, str) else known(value, form)

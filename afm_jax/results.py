@@ -1,54 +1,57 @@
-"""Methods of every result: print itself in a few lines, be drawn, become a table, be saved.
+"""Methods of every result: print itself, be drawn, become a table, be saved, be reported.
 
 The decorator `public_result` gives it to named tuples, dataclasses and modules of equinox alike, from their fields
 alone: units are the ends of the fields' names, dimensions those of the annotations. Batches, traced values and shapes
 can be printed, too.
 """
 
+import base64
 import enum
 import importlib
-import io
 import math
 import types
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
 
 import numpy as np
 
 from afm_jax.checks import in_float64, is_array
-from afm_jax.saved import fields_of, is_abstract, is_record, save
+from afm_jax.columns import csv_columns, csv_text
+from afm_jax.report import at_home, lines_of, page_of, pictures_of, sections, text_of
+from afm_jax.saved import fields_of, is_record, save, saved
+from afm_jax.strict_json import strict_json
 from afm_jax.units import unit_of
+from afm_jax.whole_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-    from rich.table import Table
     from xarray import Dataset
 
 Kind = TypeVar("Kind", bound=type)
-MOST_LINES = 20
-_WIDTH = 110
-_UNBROKEN = 10_000
-"""Columns of a text in which no line is broken."""
-_SHOWN = 5
 
 
 class Result:
     """The methods that `public_result` gives; what a named tuple has instead of this base: see `ResultTuple`."""
 
     _picture: ClassVar[str]
-    _rows: ClassVar[str]
+    _home: ClassVar[str]
     _words: ClassVar[dict[str, type[enum.IntEnum]]]
 
     def __repr__(self) -> str:
+        (fields,) = sections.dispatch(object)(self)
+        return "\n".join(lines_of(fields.title, *fields.parts))
+
+    def __str__(self) -> str:
         return text_of(self)
 
+    def _repr_html_(self) -> str:
+        return page_of(self, template="page.body.jinja")
+
     def text(self) -> str:
-        """Return what the command that computes this result prints; of a result without one its fields in 20 lines."""
-        printed = getattr(self, "printed", None)
-        return text_of(self) if printed is None else text_of_parts(printed())
+        """Return what `print` shows, and the command that computes this result; of one without a command its fields."""
+        return str(self)
 
     def plot(self, path: str | Path | None = None, **options: Any) -> "Figure":
         """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given.
@@ -57,34 +60,56 @@ class Result:
             path: of the file; None: none is written.
             options: of the picture, such as `ordinate` of a bifurcation diagram.
         """
-        module, _, name = self._picture.partition(":")
-        figure = getattr(importlib.import_module(module), name)(self, **options)
-        style = importlib.import_module("afm_jax.plots.picture_style")
+        figure, style = self._drawn(self._picture, **options), importlib.import_module("afm_jax.plots.picture_style")
         # a figure without pyplot is shown by a notebook only if it says how
         figure._repr_png_ = lambda: style.png_of(figure)
         if path is not None:
             style.save(figure, Path(path), named_by_user=True)
         return figure
 
+    def _drawn(self, function: str, **options: Any) -> Any:
+        module, _, name = function.partition(":")
+        return getattr(importlib.import_module(module), name)(self, **options)
+
+    def report(self, folder: str | Path, name: str = "", more: Sequence[Any] = ()) -> list[Path]:
+        """Write this result into a folder: a page (HTML), its text, JSON, picture and CSV files; return their paths.
+
+        Args:
+            folder: made if it is not there; files of the same names are replaced.
+            name: of the files; else that of its kind, such as fit.html.
+            more: results whose sections follow on the page and in the text.
+        """
+        folder, results, data = Path(folder), (self, *more), saved(self)
+        folder.mkdir(parents=True, exist_ok=True)
+        name = name or data["format"].rpartition(" ")[2]
+        style = importlib.import_module("afm_jax.plots.picture_style")
+        figures = {function: self._drawn(function) for function in pictures_of(self) or [self._picture]}
+        # SVG files have the layout of the PNG drawn before
+        pixels = np.concatenate([style.pixels_of(figure, _DPI) for figure in figures.values()])
+        drawn = {key: base64.b64encode(style.svg_of(figure)).decode() for key, figure in figures.items()}
+        tables = csv_columns(self) or {f"{name}.csv": _columns_of_one_shape(self)[1]}
+        contents: dict[str, str | bytes] = {
+            f"{name}.html": page_of(*results, drawn=drawn),
+            f"{name}.txt": text_of(*results) + "\n",
+            f"{name}.png": style.png_of_pixels(pixels, _DPI),
+            f"{name}.json": strict_json(data) + "\n",
+            **{file: csv_text(columns) for file, columns in tables.items()},
+        }
+        for file, content in contents.items():
+            write_whole(folder / file, content)
+        return [folder / file for file in contents]
+
     def to_pandas(self) -> "DataFrame":
         """Return a result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
         pandas = _needed("pandas")
-        if self._rows:
-            records: Any = getattr(self, self._rows)
-            records = records() if callable(records) else records
-            if isinstance(records, Mapping):
-                plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
-                return pandas.DataFrame.from_dict(plain, orient="index")
-            return pandas.DataFrame(list(records))
-        columns = {name: array for name, (array, _) in known_columns(self).items()}
-        shapes = [array.shape for array in columns.values() if array.ndim]
-        shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
-        table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
+        for columns in csv_columns(at_home(self)).values():
+            return pandas.DataFrame(dict(columns))
+        shape, columns = _columns_of_one_shape(self)
+        table = pandas.DataFrame(columns)
         table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
         if len(shape) > 1:
             table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
-        known = known_rows(self, shape).ravel()
-        return table if known.all() else table[known]
+        return table[known_rows(self, shape).ravel()] if shape else table
 
     def to_xarray(self) -> "Dataset":
         """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
@@ -107,6 +132,9 @@ class Result:
         save(self, path)
 
 
+_DPI = 190.0
+
+
 class JudgedResult(Result):
     """A result that is valid unless there are reasons why not."""
 
@@ -121,11 +149,6 @@ class JudgedResult(Result):
     def reason(self) -> str | None:
         """The first of the reasons; None if it is valid."""
         return next(iter(self.reasons), None)
-
-    @property
-    def verdict(self) -> str:
-        """The first words of its text."""
-        return "VALID" if self.valid else "NOT VALID"
 
 
 if TYPE_CHECKING:
@@ -145,46 +168,31 @@ else:
 
 
 def public_result(
-    *, picture: str = "afm_jax.plots.results:figure_of", rows: str = "", **words: type[enum.IntEnum]
+    *,
+    picture: str = "afm_jax.plots.results:figure_of",
+    home: str = "",
+    whole: bool = True,
+    **words: type[enum.IntEnum],
 ) -> Callable[[Kind], Kind]:
     """Return a decorator that makes a `Result` or `ResultTuple` a result.
 
     Args:
         picture: the function that draws it, "module:function"; as a rule its arrays against the first of them.
-        rows: the method or attribute that gives its table as mappings; as a rule the arrays of one shape are columns.
+        home: the module that registers how it is shown; "": that of the class.
+        whole: whether its file holds all its fields, and gives it back; else what its command writes.
         words: the enumeration of each field of integers that has one.
     """
 
     def decorate(kind: Kind) -> Kind:
         methods = {name: method for name, method in vars(Result).items() if callable(method)}
-        if "to_dict" in vars(kind):
-            methods["to_dict"] = vars(kind)["to_dict"]
+        methods["report"] = vars(kind).get("report", Result.report)
         methods = {name: in_float64(method, loaded=True) for name, method in methods.items()}
-        for name, value in {**methods, "_picture": picture, "_rows": rows, "_words": words}.items():
+        known = {"_picture": picture, "_home": home, "_whole": whole, "_words": words}
+        for name, value in {**methods, **known}.items():
             setattr(kind, name, value)
         return kind
 
     return decorate
-
-
-def text_of(self: Any) -> str:
-    """Return a result in at most 20 lines: a field each, arrays by their range, outcomes in words."""
-    lines = _lines(self)
-    widest = max((len(name) for name, _ in lines), default=0)
-    return "\n".join([f"{type(self).__name__}:", *(f"  {name:<{widest}}  {text}" for name, text in lines)])
-
-
-def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
-    """Return sentences and tables to print as one text; None says nothing."""
-    from rich.console import Console  # noqa: PLC0415 (help is there without it)
-
-    text = io.StringIO()
-    console = Console(file=text, width=_UNBROKEN)
-    for part in parts:
-        if part is not None:
-            is_text = isinstance(part, str)
-            console.print(part, markup=not is_text, highlight=not is_text, soft_wrap=is_text)
-    return text.getvalue().rstrip("\n")
 
 
 def columns_of(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
@@ -209,6 +217,14 @@ def known_columns(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
         array, dimensions = columns[name]
         columns[name] = np.where(gaps, math.nan, array), dimensions
     return columns
+
+
+def _columns_of_one_shape(record: Any) -> tuple[tuple[int, ...], dict[str, np.ndarray]]:
+    """Return the shape that most arrays of a record have, and these as columns."""
+    columns = {name: array for name, (array, _) in known_columns(record).items()}
+    shapes = [array.shape for array in columns.values() if array.ndim]
+    shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
+    return shape, {name: array.ravel() for name, array in columns.items() if array.shape == shape}
 
 
 def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -240,62 +256,3 @@ def _dimensions(kind: type, name: str, count: int) -> tuple[str, ...]:
 
 def _annotations(kind: type) -> dict[str, Any]:
     return {name: hint for each in kind.__mro__[::-1] for name, hint in vars(each).get("__annotations__", {}).items()}
-
-
-def _lines(record: Any) -> list[tuple[str, str]]:
-    """Return names and texts of a record's fields, as many as a text may have lines."""
-    words = getattr(type(record), "_words", {})
-    lines = [(name, _in_words(value, words.get(name))) for name, value in fields_of(record)]
-    lines = [(name, text if len(text) <= _WIDTH else f"{text[: _WIDTH - 4]} ...") for name, text in lines]
-    if len(lines) < MOST_LINES:
-        return lines
-    names = ", ".join(name for name, _ in lines[MOST_LINES - 2 :])
-    return [*lines[: MOST_LINES - 2], ("and", names[:_WIDTH])]
-
-
-def _in_words(value: Any, words: type[enum.IntEnum] | None = None) -> str:  # noqa: PLR0911 (one return a kind of value)
-    if value is None:
-        return "none"
-    if is_abstract(value):
-        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
-    if is_array(value) or isinstance(value, bool | int | float):
-        return _numbers_in_words(np.asarray(value), words)
-    if isinstance(value, str | Path):
-        return " ".join(str(value).split()) or "''"
-    if is_record(value):
-        return f"{type(value).__name__}({', '.join(f'{name} {_in_words(item)}' for name, item in fields_of(value))})"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_in_words(item)}" for key, item in value.items()) or "nothing"
-    if isinstance(value, list | tuple):
-        more = [f"and {len(value) - _SHOWN} more"] * (len(value) > _SHOWN)
-        return "; ".join([*map(_in_words, value[:_SHOWN]), *more]) or "nothing"
-    return "a function" if callable(value) else type(value).__name__
-
-
-def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
-    flat = array.ravel()
-    shape = "" if array.ndim < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, array.shape))}) "
-    if words is not None:
-        names = {int(each): each.name.lower().replace("_", " ") for each in words}
-        if flat.size == 1:
-            return getattr(words(flat[0]), "sentence", names[flat[0]]) if flat[0] in names else str(flat[0])
-        return shape + ", ".join(f"{count} {names.get(n, n)}" for n, count in Counter(flat.tolist()).items())
-    if flat.dtype.kind not in "biufc":
-        return f"{shape}{flat.dtype}"
-    if flat.size <= _SHOWN:
-        # of several numbers those that are not known are dashes, as in tables
-        unknown = "-" if flat.size > 1 else "not known"
-        return shape + (", ".join(_one(each, unknown) for each in flat.tolist()) or "nothing")
-    if flat.dtype.kind == "b":
-        return f"{shape}{flat.sum()} of {flat.size} yes"
-    size = np.abs(flat) if flat.dtype.kind == "c" else flat
-    finite = size[np.isfinite(size)]
-    ends = "none known" if not finite.size else f"{_one(finite.min().item())} to {_one(finite.max().item())}"
-    unknown = flat.size - finite.size
-    return f"{shape}{ends}" + (f", {unknown} not known" if unknown and finite.size else "")
-
-
-def _one(value: Any, unknown: str = "not known") -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return unknown if value != value else f"{value:.6g}"  # noqa: PLR0124 (NaN alone is not itself)

@@ -18,7 +18,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, singledispatch
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
@@ -73,18 +73,26 @@ def is_abstract(value: Any) -> bool:
     return isinstance(value, Tracer | ShapeDtypeStruct)
 
 
+@singledispatch
+def as_json(result: Any) -> dict[str, Any]:
+    """Return a result as its command writes it: fields and verdict, if its kind does not register other keys."""
+    return dict(fields_of(result)) | ({"valid": result.valid} if hasattr(result, "valid") else {})
+
+
 def saved(result: Any) -> dict[str, Any]:
     """Return a result as the object of its JSON file.
 
     Raises:
         ValueError: if a number in it is traced.
     """
-    own = result.to_dict() if hasattr(result, "to_dict") else {}
-    head = {"format": FORMAT, "format_version": FORMAT_VERSION} | own
+    has_own = as_json.dispatch(type(result)) is not as_json.dispatch(object)
+    head = {"format": FORMAT, "format_version": FORMAT_VERSION} | (as_json(result) if has_own else {})
     meanings = {
         name: {str(int(each)): getattr(each, "sentence", each.name.lower().replace("_", " ")) for each in kind}
         for name, kind in getattr(type(result), "_words", {}).items()
     }
+    if not getattr(type(result), "_whole", True):
+        return head
     return head | {"afm_jax": __version__, "meanings": meanings, **_record(result, type(result).__name__)}
 
 

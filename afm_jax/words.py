@@ -4,9 +4,9 @@ import contextlib
 import difflib
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
-from typing import Any, SupportsFloat
+from typing import SupportsFloat
 
 
 def decimals(width: float, *, unknown: int = 4) -> int:
@@ -126,47 +126,42 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def plain_words(value: Any) -> str:
-    """Return a plain value as text: numbers short, lists joined, mappings as 'name: value'.
+def is_words(cells: Iterable[str]) -> bool:
+    """Say whether a column holds words, not numbers: some cell begins with a letter, or has two beside each other.
 
-    >>> plain_words({"seed": 3, "ends": [0.1, None], "scaled": False})
-    'seed: 3; ends: 0.1, none; scaled: no'
+    >>> is_words(["0.95 to 0.96", "-"]), is_words(["1e-05", "12/13", "0.3 +- 0.1"])
+    (True, False)
     """
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, Mapping):
-        return "; ".join(f"{name}: {plain_words(item)}" for name, item in value.items()) or "none"
-    if isinstance(value, Iterable) and not isinstance(value, str):
-        return ", ".join(plain_words(item) for item in value) or "none"
-    return str(value)
+    return any(_WORD.search(cell) for cell in cells)
 
 
-def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> list[str]:
-    """Return lines of a table, indented, columns as wide as what is in them.
+_WORD = re.compile(r"^[^\W\d_]|[^\W\d_]{2}")
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    r"""Return lines of a table, indented, columns as wide as what is in them: words to the left, numbers to the right.
 
     Args:
-        head: the columns' names.
+        head: the columns' names, in one line or two; empty ones take no line.
         rows: a cell for each column.
-        words: the columns that hold words, set to the left; numbers are set to the right.
 
-    >>> text_table(["", "value"], [["r", "0.95"], ["epsilon", "60"]])
-    ['           value', '  r         0.95', '  epsilon     60']
+    >>> text_table(["", "value\nnm"], [["r", "0.95"], ["epsilon", "60"]])
+    ['           value', '              nm', '  r         0.95', '  epsilon     60']
     """
-    cells = [list(head), *map(list, rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    sides = ["<" if k in words else ">" for k in range(len(head))]
+    rows, heads = [*map(list, rows)], [name.split("\n") for name in head]
+    depth = max(map(len, heads)) if any(head) else 0
+    above = [[name[k] if k < len(name) else "" for name in heads] for k in range(depth)]
+    widths = [max(map(len, column)) for column in zip(*above, *rows, strict=True)]
+    sides = ["<" if is_words(column) else ">" for column in zip(*rows, strict=True)] or [">"] * len(head)
     lines = [
         "".join(f"  {cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
-        for line in cells
+        for line in [*above, *rows]
     ]
     if len(head) < 3 or max(map(len, lines)) <= _room.get():
         return lines
-    left = max(map(len, head))
-    blocks = [["", *(f"  {name:{left}}  {cell}" for name, cell in zip(head, row, strict=True))] for row in cells[1:]]
+    names = [" ".join(name).strip() for name in heads]
+    left = max(map(len, names))
+    blocks = [["", *(f"  {name:{left}}  {cell}" for name, cell in zip(names, row, strict=True))] for row in rows]
     return [line for block in blocks for line in block][1:]
 
 
@@ -186,15 +181,6 @@ def lines_at_most(width: int) -> Iterator[None]:
 
 
 _room: ContextVar[float] = ContextVar("_room", default=math.inf)
-
-
-def bullets(title: str, items: Sequence[str]) -> list[str]:
-    """Return lines of a list below its title, an empty line before it; nothing if there are no items.
-
-    >>> bullets("Notes:", ["one"])
-    ['', 'Notes:', '  - one']
-    """
-    return ["", title, *(f"  - {item}" for item in items)] if items else []
 
 
 def shown(text: str) -> str:

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.stats import chi2 as chi2_distribution
 
+from afm_jax.columns import csv_columns
 from fitting import calibrate, read_resonance
 from fitting.calibration.calibrate import CalibratedValue
 from fitting.calibration.sweep import Resonance
@@ -156,7 +157,7 @@ def test_order_of_the_points_and_sign_and_turns_of_the_phase_do_not_matter(rever
     plain = calibrate(sweep)
     assert result.phase_reversed == (reverse < 0.0)
     assert result.quality_factor.value == pytest.approx(plain.quality_factor.value, rel=1e-9)
-    columns = result.tables()["calibration_points.csv"]
+    columns = csv_columns(result)["calibration_points.csv"]
     assert np.abs(columns["fitted_phase_deg"] - phase).max() < 10.0
     for found, reversed_phase in ((result, reverse < 0.0), (plain, False)):
         assert any("sign was reversed" in warning for warning in found.warnings) == reversed_phase

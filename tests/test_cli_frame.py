@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
-from rich.table import Table
 
 import afm_jax
 import fitting
@@ -24,9 +23,8 @@ from afm_jax.cli import main, session
 from afm_jax.cli.command import Command, Output
 from afm_jax.cli.ending import NotValid
 from afm_jax.cli.session import Session
-from afm_jax.columns import printed_table
-from afm_jax.results import text_of_parts
-from afm_jax.words import text_table
+from afm_jax.columns import columns_of
+from afm_jax.report import Table, lines_of, table_of
 from tests import trial_commands
 from tests.fresh_python import outputs, python
 
@@ -162,24 +160,21 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
     rows = [[f"{1e5 * (k + 1) / 7 + row:.9g}" for k in range(8)] for row in range(5)]
 
     def body(session: Session) -> None:
-        table = Table(
-            *(head.replace(" nm", "\nnm") for head in heads), title="Speeds in a sentence that goes on and on"
-        )
-        for row in rows:
-            table.add_row(*row)
+        table = Table("", [head.replace(" nm", "\nnm") for head in heads], rows)
+        title = "Speeds in a sentence that goes on and on"
         prose = "12345678.9 " * 20 + "[not markup] " + "end " * 20
-        session.emit({}, table, lambda: "\n".join(text_table(heads, rows)), prose)
+        session.emit({}, title, table, prose)
 
     monkeypatch.setenv("COLUMNS", str(width))
     result = trial(body)
     assert result.exception is None, result.exception
     words = result.stdout.split()
     assert max(map(len, result.stdout.splitlines())) <= width
-    assert all(words.count(cell) == 2 for row in rows for cell in row)
+    assert all(words.count(cell) == 1 for row in rows for cell in row)
     assert words.count("12345678.9") == 20
     # nobody looks at a pipe: the table stays as it is
     monkeypatch.delenv("COLUMNS")
-    assert sum(all(cell in line for cell in rows[0]) for line in trial(body).stdout.splitlines()) == 2
+    assert sum(all(cell in line for cell in rows[0]) for line in trial(body).stdout.splitlines()) == 1
 
 
 def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Callable[..., Result]):
@@ -193,17 +188,19 @@ def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Calla
 def test_tables_to_print_have_dashes_and_words():
     cells = {"name": "name", "x\nnm": "x", "short": "x:.2f", "good": "ok", "twice": lambda row: 2.0 * (row["x"] or 0.0)}
     rows = [{"name": "a", "x": 1.23456789, "ok": True}, {"name": "b", "x": None, "ok": np.bool_(0)}]
-    table = printed_table("Title", cells, rows)
-    texts = [["a", "b"], ["1.23457", "-"], ["1.23", "-"], ["yes", "no"], ["2.46914", "0"]]
-    assert [list(column.cells) for column in table.columns] == texts
-    assert [column.justify for column in table.columns] == ["left", "right", "right", "left", "right"]
-    assert all(cell in text_of_parts(["One.", table, None]) for cell in ("One.", "Title", "1.23457"))
+    table = table_of(cells, rows)
+    assert table.rows == [["a", "1.23457", "1.23", "yes", "2.46914"], ["b", "-", "-", "no", "0"]]
+    assert table.words == [True, False, False, True, False]
+    lines = ["  name        x  short  good    twice", "             nm", "  a     1.23457   1.23  yes   2.46914"]
+    assert lines_of("One.", None, table)[:4] == ["One.", *lines]
 
 
 def test_tables_land_in_the_folder(trial: Callable[..., Result], tmp_path: Path):
     rows = [{"x": 0.1, "ok": True}, {"x": float("nan"), "ok": np.bool_(0)}, {"ok": None}]
     folder = tmp_path / "new" / "folder"
-    result = trial(lambda session: session.write_table("rows.csv", rows, ["x", "ok"]), "--out", str(folder))
+    result = trial(
+        lambda session: session.write_columns("rows.csv", columns_of(rows, ["x", "ok"])), "--out", str(folder)
+    )
     assert result.exit_code == 0
     assert (folder / "rows.csv").read_text("utf-8") == "x,ok\n0.1,true\n,false\n,\n"
 

@@ -32,6 +32,7 @@ from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.dynamics.special_points import at_lost_ends
 from afm_jax.impact.closure import OrbitProblem, closing_residual
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
 
@@ -299,7 +300,7 @@ def fit_file(path: Path) -> str:
         capture_changes=factor.T @ of_capture,
         capture_speed_nm_per_us=np.sqrt(60.0) / 0.95,
     )
-    payload = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": law.to_dict()}
+    payload = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": as_json(law)}
     path.write_text(json.dumps(payload), encoding="utf-8")
     return str(path)
 

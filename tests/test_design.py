@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.saved import as_json
 from fitting import design, drive_grid, fit, prior_of_values
 from fitting.experiments.candidates import Candidates, candidates_of, explained
 from fitting.experiments.design import Design
@@ -102,7 +103,7 @@ def test_drives_are_left_out_for_a_reason(drives, of_law):
 def test_a_fit_is_added_to(drives, of_law):
     exact = other_amplitudes(of_law.drives)
     result = fit(table_of(of_law.drives, exact, NOISE * exact, quality_factor_error=QUALITY_FACTOR[1]), "law")
-    stated = result.to_dict()["parameters"]
+    stated = as_json(result)["parameters"]
     assert [*stated] == [*of_law.expected]
     # without noise the fit ends at the believed law: its own minimum is good to 1e-5 standard errors
     np.testing.assert_allclose(errors_of(stated), errors_of(of_law.expected), rtol=1e-4)

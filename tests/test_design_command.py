@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from afm_jax.saved import as_json
 from fitting import fit, read_table
 from tests.answers import answer as answer_of
 from tests.fit_tables import EXAMPLE, rows
@@ -46,7 +47,7 @@ def test_json_holds_points_and_what_they_promise(reported):
 def test_what_was_measured_is_not_planned_again(tmp_path):
     table = rows(read_table(EXAMPLE), slice(0, 20))
     path = tmp_path / "fit.json"
-    path.write_text(json.dumps(fit(table, "law").to_dict()), encoding="utf-8")
+    path.write_text(json.dumps(as_json(fit(table, "law"))), encoding="utf-8")
     columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
     frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
     heights = f"{offset},{offset + 0.125}"

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from afm_jax.saved import as_json
 from afm_jax.strict_json import strict_json
 from fitting import fit
 from fitting.infer import fit as fitting_fit
@@ -68,7 +69,7 @@ def test_a_fit_whose_slopes_are_not_finite_is_not_valid_and_says_why(table, law,
     result = fit(table, "law")
     assert not result.valid
     assert result.reasons[0].startswith("Not converged: the slopes of the residuals are not finite")
-    assert strictly(strict_json(result.to_dict()))["convergence"]["reason"] == result.convergence.reason
+    assert strictly(strict_json(as_json(result)))["convergence"]["reason"] == result.convergence.reason
     assert result.chi2 == pytest.approx(law.chi2)
 
 

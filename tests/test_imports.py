@@ -18,6 +18,7 @@ ROWS = {
         ("compilation_cache",),
         ("checks",),
         ("saved",),
+        ("report",),
         ("results",),
         ("solve", "apparatus"),
         ("impact",),

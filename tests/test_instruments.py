@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 import fitting.instruments.recording as recording_module
 from afm_jax.cli.main import main
+from afm_jax.saved import as_json
 from fitting import TableError, read_curve, read_curves, read_table
 from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
 from fitting.instruments.curve import MeasuredCurve, table_text
@@ -464,7 +465,7 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: py
 
 def test_tapping_takes_a_curve_that_was_read_and_its_file_alike():
     of_file, of_curve = (
-        tapping(source, law=False, **options).to_dict()
+        as_json(tapping(source, law=False, **options))
         for source, options in ((EXAMPLE, OPTIONS), (read_curve(EXAMPLE, **OPTIONS), {}))
     )
     assert of_file["valid"]

@@ -47,7 +47,8 @@ def test_amplitudes_at_all_orders_are_printed_and_written(tmp_path: Path):
     # a drawn picture has many shades
     assert len(np.unique(imread(out / "lockin.png"))) > 50
     said = run(*call).stdout
-    assert said.startswith("VALID: order 3 of 545.4 kHz")
+    assert said.startswith("Order 3 of 545.4 kHz")
+    assert said.splitlines()[2] == "VALID"
     assert f"{told['lockin_amplitude_nm']:.6g}" in said
     # the function takes the file, too
     assert lockin(path, drive_frequency_khz=545.4, order=3).lockin_amplitude_nm == told["lockin_amplitude_nm"]

@@ -15,7 +15,6 @@ from fitting import read_curve
 from fitting.instruments.curve import table_text
 from fitting.instruments.lag import PhaseSense
 from fitting.tables.table import AmplitudeTable, parse_table, write_table
-from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import curve_of, tapping, with_sense_of_phase
 from tests.instrument_files import separated
@@ -85,11 +84,11 @@ def outcome(tip: Tip, truth: Truth, sign: float, result: Tapping) -> str:
     if sense.origin == "assumed":
         assert tip.ratio == 1.0
         assert any("which is assumed" in note for note in sense.notes)
-        text = tapping_summary(result)
+        text = str(result)
         assert "repulsive?" in text or "attractive?" in text
     else:
         assert sense.sign == sign
-        assert "repulsive?" not in tapping_summary(result)
+        assert "repulsive?" not in str(result)
     off = rows_off(result, truth)
     assert len(off) > 20
     # harmonics of a lasting impact are not quite those assumed

@@ -9,6 +9,7 @@ import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.saved import as_json
 from fitting import fit, posterior
 from fitting.infer.fit import explained_of
 from fitting.sampling.posterior import LogDensity, log_density_of
@@ -110,7 +111,7 @@ def of_lasting():
 
 def test_the_posterior_of_impacts_that_last_is_that_of_the_fit(of_lasting):
     result, found = of_lasting
-    assert found.method == found.to_dict()["method"] == "gaussian"
+    assert found.method == as_json(found)["method"] == "gaussian"
     assert found.converged
     errors = standard_errors_of(result)
     off = np.array(list(found.mean.values())) - values_of(result)

@@ -18,13 +18,14 @@ import pytest
 
 import afm_jax as afm
 import fitting
-from afm_jax import results, saved
+from afm_jax import report, results, saved
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from fitting.infer.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
 from tests.fresh_python import python
+from tests.html_pages import read_page
 from tests.lockin_traces import noisy_bounce
 from tests.strict_reading import strictly
 
@@ -124,7 +125,7 @@ def record(request: pytest.FixtureRequest) -> Any:
 def test_a_result_says_itself_in_a_few_lines_and_becomes_a_data_set(record: Any):
     lines = repr(record).splitlines()
     assert lines[0] == f"{type(record).__name__}:"
-    assert len(lines) <= results.MOST_LINES
+    assert len(lines) <= report.MOST_LINES
     assert max(map(len, lines)) <= 160
     data = record.to_xarray()
     assert len(data) >= sum(isinstance(value, np.ndarray) for _, value in saved.fields_of(record))
@@ -133,7 +134,7 @@ def test_a_result_says_itself_in_a_few_lines_and_becomes_a_data_set(record: Any)
 
 def test_a_result_comes_back_from_its_file(record: Any, tmp_path: Path):
     path, name = tmp_path / "result.json", type(record).__name__
-    if hasattr(record, "to_dict"):
+    if saved.as_json.dispatch(type(record)) is not saved.as_json.dispatch(object):
         # what its command writes is made from real results elsewhere
         payload = {"format": saved.FORMAT, "format_version": 1, **saved._record(record, name)}
         path.write_text(saved.strict_json(payload))
@@ -171,9 +172,9 @@ def test_outcomes_are_words_and_traced_values_and_shapes_can_be_told():
         jax.jit(lambda x: SOME(x, x, x).save("never.json"))(1.0)
 
 
-def test_numbers_that_are_not_known_are_dashes_among_others_and_words_alone():
+def test_numbers_that_are_not_known_are_dashes():
     lines = repr(SOME(np.array([math.nan, math.nan, 1.5]), math.nan, np.full(9, math.nan))).splitlines()
-    assert [line.split(None, 1)[1] for line in lines[1:]] == ["-, -, 1.5", "not known", "(9) none known"]
+    assert [line.split(None, 1)[1] for line in lines[1:]] == ["-, -, 1.5", "-", "(9) none known"]
 
 
 def test_other_files_are_refused(tmp_path: Path):
@@ -248,6 +249,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     prior = fitting.prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0)
     size = {"orders": (1,), "amplitudes_nm": (2.0, 4.0), "offsets_nm": (0.0,), "detunings": (0.98, 1.0)}
     fitted: Any = example_fit()
+    row = {"model": "law", "chi2": 5.0, "degrees_of_freedom": 6, "valid": True}
     computed: list[Any] = [
         afm.single_impact_orbits(scene, 1),
         afm.stability_chart(plane, x_values=np.array([0.9, 1.0, 1.01]), y_values=np.array([3.0, 4.0]), last_order=1),
@@ -255,20 +257,21 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         fitted,
         fitting.invert(fitting.read_table(EXAMPLE)),
         fitting.design(prior, fitting.drive_grid(**size, free_frequency_khz=90.0), points=2),
-        Comparison([{"model": "law"}], "one only", {"law": fitted}),
+        Comparison([row | {"aic": 9.0, "delta_aic": 0.0}], "one only", {"law": fitted}),
         fitting.lockin(*noisy_bounce(1)[:2], 181.8, 1),
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW
     for record in computed:
-        path = tmp_path / f"{type(record).__name__}.json"
-        record.save(path)
-        again = fitting.load(path)
-        assert parts_of(again) == parts_of(record), path.stem
+        files = {path.suffix: path for path in record.report(tmp_path / type(record).__name__, "it")}
+        again = fitting.load(files[".json"])
+        assert parts_of(again) == parts_of(record), files
         assert repr(again) == repr(record).replace("a function", "none")
-        record.plot(path.with_suffix(".png"))
-        assert path.with_suffix(".png").stat().st_size > 5000
+        assert files[".png"].stat().st_size > 5000
+        assert str(record) in files[".txt"].read_text()
+        assert any("svg+xml" in each.attrib["src"] for each in read_page(files[".html"].read_text()).iter("img"))
         assert len(record.to_pandas())
-    payload = json.loads((tmp_path / "FitResult.json").read_text())
+        assert len(files[".csv"].read_text().splitlines()) > 1
+    payload = json.loads((tmp_path / "FitResult" / "it.json").read_text())
     assert payload["parameters"]["r"]["value"] == fitted.parameters["r"].value
 
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 import fitting
 from afm_jax.cli.main import main
+from afm_jax.saved import as_json
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
@@ -21,7 +22,6 @@ from fitting.tapping_curves.energy import (
     positive_bands,
     said_of,
 )
-from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.tapping import tapping
 from tests.answers import answer
 from tests.html_pages import first_screen, read_page
@@ -179,7 +179,7 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     # the law is refused, with what to record instead
     assert result.law is None
     assert "3 to 10 % above resonance" in (result.reason or "")
-    assert "No impact law: driven at 1.000" in tapping_summary(result)
+    assert "No impact law: driven at 1.000" in str(result)
     (branch,) = (one for one in result.hysteresis if one.change == "branch")
     assert branch.approach is not None
     assert branch.retract is not None
@@ -231,8 +231,8 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
 def test_without_a_spring_constant_energies_are_over_it():
     table = replace(made_curve(), calibration={"phase_zero_deg": (3.0, 0.2)})
     found = tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None), law=False)
-    told = found.to_dict()
-    wanted = tapping(replace(table, spring_constant_error_n_per_m=1e-6), law=False).to_dict()
+    told = as_json(found)
+    wanted = as_json(tapping(replace(table, spring_constant_error_n_per_m=1e-6), law=False))
     assert told["energy_per_tap_aj"] is None
     per_tap = told["energy_per_tap_over_k_nm2"]
     assert per_tap["value"] == pytest.approx(wanted["energy_per_tap_aj"]["value"] / K, rel=1e-3)
@@ -241,7 +241,7 @@ def test_without_a_spring_constant_energies_are_over_it():
         assert "energy_aj" not in one["curve"]
     # m/k cancels in it
     assert told["epsilon_nm2_per_us2"]["value"] == pytest.approx(wanted["epsilon_nm2_per_us2"]["value"], rel=1e-3)
-    text = tapping_summary(found)
+    text = str(found)
     assert re.search(r"Energy of a tap: [\d.]+ \+- [\d.]+ nm\^2 ", text)
     assert not re.search(r" eV|\d aJ", text)
 

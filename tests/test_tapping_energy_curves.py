@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from afm_jax.saved import as_json
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
-from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from fitting.tapping_curves.together import tapping_together
@@ -49,7 +49,7 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     truth = curve_like_graphite()
     table = table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(1), free_rows=30)
     result = tapping(table, law=False)
-    answer = result.to_dict()
+    answer = as_json(result)
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
     assert "one energy for each branch does not describe the rows" in answer["energy_per_tap_reason"]
@@ -70,9 +70,7 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     ratio = np.interp(turn["approach"]["offset_nm"], truth.height_nm, truth.amplitude_nm / 13.4)
     assert ratio == pytest.approx(0.912, abs=0.004)
     assert answer["largest_energy_aj"]["value"] == pytest.approx(12.0, rel=0.08)
-    assert re.search(
-        r"Energy of a tap: 1[12].\d+ \+- 0.\d+ aJ at 0.[78]\d of the free amplitude", tapping_summary(result)
-    )
+    assert re.search(r"Energy of a tap: 1[12].\d+ \+- 0.\d+ aJ at 0.[78]\d of the free amplitude", str(result))
 
 
 EXACT = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9, phase_noise_deg=0.2)
@@ -89,7 +87,7 @@ def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid
         zero = {"phase_zero_deg": (3.0 + 0.2 * rng.normal(), 0.2)} if zero_known else {}
         table = replace(table, calibration=table.calibration | zero)
         result = tapping(replace(table, free_frequency_khz=frequency, quality_factor=quality), law=False)
-        answer = result.to_dict()
+        answer = as_json(result)
         assert answer["assumed_errors"] == {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
         assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
         assert result.valid == zero_known
@@ -201,7 +199,7 @@ def test_each_free_amplitude_has_an_energy_of_its_own():
     result = tapping(replace(one, **both, **error), law=False)
     assert (result.valid, result.energy["value"]) == (True, None)
     assert "each drive has its own" in result.energy["reason"]
-    for branch, true in zip(result.to_dict()["branches"], tips, strict=True):
+    for branch, true in zip(as_json(result)["branches"], tips, strict=True):
         low, high = branch["interval95_aj"]
         assert low < true < high
 

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from afm_jax.saved import as_json
 from fitting import TableError, tapping_map
 from fitting.examples.make_raw_curve import (
     DRIVE_KHZ,
@@ -93,7 +94,7 @@ def test_pixels_out_of_range_are_masked_and_counted():
     amplitude[0, :4], lag[1, :3], amplitude[2, :2] = 1.1 * FREE_NM, -30.0, np.nan
     found = tapping_map((amplitude, lag), amplitude_error_nm=0.03, phase_error_deg=0.12, **LEVER)
     counts = {"used": 231, "amplitude above free": 4, "energy below zero": 3, "not measured": 2}
-    assert found.to_dict()["pixels"] == {"rows": 12, "columns": 20, **counts}
+    assert as_json(found)["pixels"] == {"rows": 12, "columns": 20, **counts}
     masked = found.state != 0
     assert np.all(np.isnan(found.energy[masked]))
     np.testing.assert_allclose(found.energy[~masked], energy[~masked], rtol=2e-4)

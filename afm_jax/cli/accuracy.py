@@ -7,7 +7,8 @@ from click import IntRange
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import load_named
 from afm_jax.cli.session import Session
-from afm_jax.columns import columns_of, printed_table
+from afm_jax.columns import columns_of
+from afm_jax.report import table_of
 from afm_jax.studies import timing
 from afm_jax.studies.accuracy import measured
 
@@ -51,7 +52,8 @@ def accuracy(
     return Output(
         payload={"problem": study, **result},
         text=[
-            printed_table(title, _CELLS, rows, form=".3g"),
+            title,
+            table_of(_CELLS, rows, form=".3g"),
             *dict.fromkeys(f"{row['method']}, {row['setting']}: {row['reason']}" for row in rows if "reason" in row),
             reference,
         ],

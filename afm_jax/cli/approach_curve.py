@@ -8,8 +8,9 @@ import numpy as np
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
-from afm_jax.columns import Cell, printed_table, rows_of
+from afm_jax.columns import rows_of
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve
+from afm_jax.report import Cell, table_of
 from fitting.simulated.experiment import table_of_curve
 from fitting.tables.table import write_table
 
@@ -59,7 +60,7 @@ def approach(
             "settings": settings | errors,
         },
         text=[
-            printed_table("Approach curve", _CELLS, rows_of(points)),
+            table_of(_CELLS, rows_of(points)),
             free_tip,
             *(f"{count} of {len(curve.reasons)}: {kind.sentence}" for kind, count in counted.items() if count),
         ],

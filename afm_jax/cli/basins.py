@@ -4,7 +4,7 @@ from typing import Annotated
 
 from click import IntRange
 
-from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.command import Output
 from afm_jax.cli.scenes import NamedScene, as_drawn
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Grid
@@ -43,4 +43,4 @@ def basins(
         if scene.unknowns is not None:
             band = drawn_shares(scene.scene, result, scene.unknowns, draws=draws)
             result = result._replace(share_interval95=band)
-    return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result)})
+    return Output.of(result, "basins")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from click import IntRange
 
-from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.command import Output
 from afm_jax.cli.scenes import NamedScene, ranges_of
 from afm_jax.cli.session import Session
 from afm_jax.dynamics.charts import stability_chart, stable_probability
@@ -46,5 +46,4 @@ def chart(
         if scene.unknowns is not None:
             probability = stable_probability(scene.scene, result, scene.unknowns, (across.path, up.path), draws=draws)
             result = replace(result, probability=probability)
-    files = {"chart.png": picture_of("dynamics:chart_figure", result)}
-    return Output.of(result, files=files)
+    return Output.of(result, "chart")

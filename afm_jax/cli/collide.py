@@ -13,6 +13,7 @@ from afm_jax.cli.values import Ends, Numbers, Positive, option_of
 from afm_jax.contact.collide import collisions
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import DEFAULTS, EFFECTS, idle_without
+from afm_jax.saved import as_json
 from afm_jax.scenefile.contact import contact_parameters, make_contact
 from afm_jax.scenefile.law_files import save_law, save_law_csv
 from afm_jax.scenefile.scenefile import MASS_ASSUMED, read_scene
@@ -56,13 +57,11 @@ def collide(
     if make_law:
         with session.working("fitting (the first run compiles for some seconds)"):
             laws = contact_laws(chosen, speed_range=speed_range, mass_ng=mass, points=points or 512)
-        text = laws.printed()
-        if session.out is not None:
-            text.append(f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.')
+        use = f'In a scene file: [interaction] model = "law", file = "{session.out}/law.json"; or --law.'
         return Output.of(
             laws,
-            payload=laws.to_dict() | told,
-            text=text,
+            payload=as_json(laws) | told,
+            text=[laws, use if session.out else None],
             files={"law.json": partial(save_law, laws.law), "law.csv": partial(save_law_csv, laws.law)},
             json_file="collide.json",
         )
@@ -72,7 +71,7 @@ def collide(
     title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
     return Output.of(
         result,
-        payload=result.to_dict() | told | {"settings": settings},
+        payload=as_json(result) | told | {"settings": settings},
         files={"collide.png": picture_of("collisions:collisions_figure", result, title)},
         json_file="collide.json",
     )

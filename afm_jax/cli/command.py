@@ -11,8 +11,8 @@ itself):
             result = basins_of_attraction(scene.scene, report=report)
         return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result)})
 
-A result says itself: `to_dict()` is the JSON object, `printed()` what is written in the terminal, `tables()` are the
-columns of CSV files by the files' names, `reason` is why it is not valid.
+Of a result `as_json` is the JSON object, `sections` what is written in the terminal, `csv_columns` are the columns of
+CSV files by the files' names, `reason` is why it is not valid.
 """
 
 import re
@@ -29,6 +29,7 @@ import click
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE, described
 from afm_jax.cli.session import Session, session_options, write_json
+from afm_jax.columns import csv_columns
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.whole_files import arguments_named, in_callers_words
 
@@ -45,7 +46,7 @@ class Output:
         tables: columns by their names for each CSV file of the --out folder, by its name.
         files: functions that write a file of the --out folder at a path each, by its name.
         json_file: name of the file of the --out folder that holds the JSON object; empty: none does.
-        report: writes a report into a folder and returns the paths; it gets the folder and `Session.write_table`.
+        report: writes a report into a folder and returns the paths.
         not_valid: why the result is not valid, which makes the exit code 3; None: it is valid.
     """
 
@@ -60,31 +61,28 @@ class Output:
 
     @classmethod
     def of(cls, result: Any, stem: str = "", **more: Any) -> "Output":
-        """Return what is handed out of a result that says itself.
+        """Return what is handed out of a result.
 
         Args:
-            result: has `to_dict`, `printed` and `tables`, `reason` (which is a key of the JSON object, too) and, where
-                its impacts may be extrapolated, `impact_speeds_nm_per_us`.
+            result: has `reason`, or `valid` and `reasons`, and where its impacts may be extrapolated
+                `impact_speeds_nm_per_us`; `as_json`, `sections` and `csv_columns` know its kind.
             stem: what its picture and its JSON file are called; empty: it has none.
             **more: pictures, and what else the output has.
         """
+        from afm_jax.saved import as_json  # noqa: PLC0415 (help needs no NumPy)
+
+        reason, reasons = getattr(result, "reason", None), getattr(result, "reasons", None)
         told = {
-            "payload": {**result.to_dict(), "reason": result.reason},
-            "text": result.printed(),
-            "tables": {} if "tables" in more else result.tables(),
+            "payload": as_json(result) | ({"reason": reason} if hasattr(result, "reason") else {}),
+            "text": [result],
+            "tables": {} if more.keys() & {"tables", "report"} else csv_columns(result),
             "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
-            "not_valid": result.reason,
+            "not_valid": reason if reasons is None else next(iter(reasons), None),
         }
         if stem:
             save = later("afm_jax.plots.picture_style:save")
             told |= {"files": {f"{stem}.png": lambda path: save(result.plot(), path)}, "json_file": f"{stem}.json"}
         return cls(**told | more)
-
-    @classmethod
-    def of_report(cls, result: Any, summary: Callable[[], str], report: Callable[..., Sequence[Path]]) -> "Output":
-        """Return what is handed out of a result of `fitting`, which has `to_dict`, `valid` and `reasons`."""
-        not_valid = None if result.valid else result.reasons[0]
-        return cls(payload=result.to_dict(), text=[summary], report=report, not_valid=not_valid)
 
 
 def later(function: str) -> Callable[..., Any]:
@@ -246,15 +244,13 @@ def hand_out(session: Session, output: Output) -> None:
         NotValid: if the result says that it is not valid.
     """
     if session.out is not None:
+        writers = {output.json_file: partial(write_json, payload=output.payload)} if output.json_file else {}
         for name, columns in output.tables.items():
             session.write_columns(name, columns)
-        writers = dict(output.files)
-        if output.json_file:
-            writers[output.json_file] = partial(write_json, payload=output.payload)
-        for name, write in writers.items():
+        for name, write in {**writers, **output.files}.items():
             write(session.out / name)
             session.note(f"wrote {session.out / name}")
-        for path in () if output.report is None else output.report(session.out, session.write_table):
+        for path in () if output.report is None else output.report(session.out):
             session.note(f"wrote {path}")
     session.emit(output.payload, *output.text)
     if output.not_valid is not None:

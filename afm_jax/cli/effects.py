@@ -8,6 +8,7 @@ from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Names, Positive, Share
 from afm_jax.motion.start import default_start, start_of
+from afm_jax.saved import as_json
 from afm_jax.scenefile.scenefile import as_in_file, save_scene, scene_tables
 from afm_jax.studies.effects import study_effects
 from afm_jax.whole_files import check_plain
@@ -47,17 +48,12 @@ def effects(
             only=only,
             report=report,
         )
-    payload = study.to_dict() | {"start": start._asdict()}
+    payload = as_json(study) | {"start": start._asdict()}
     payload["reduced"]["scene"] = scene_tables(study.reduction.scene)
 
     def write_reduced(path: Path) -> None:
         check_plain(path)
         save_scene(study.reduction.scene, path, start=start)
 
-    return Output(
-        payload=payload,
-        text=study.printed(),
-        tables=study.tables(),
-        files={"effects.png": picture_of("effects:effects_figure", study), "reduced.toml": write_reduced},
-        json_file="effects.json",
-    )
+    files = {"effects.png": picture_of("effects:effects_figure", study), "reduced.toml": write_reduced}
+    return Output.of(study, payload=payload, files=files, json_file="effects.json")

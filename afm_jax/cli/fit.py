@@ -1,7 +1,6 @@
 """`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,12 +13,13 @@ from afm_jax.cli.session import Session
 from afm_jax.cli.tables import example_path
 from afm_jax.cli.values import Constraint, Fixed, ModelName, Names, QualityFactor, Share
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
+from afm_jax.report import text_of
+from afm_jax.saved import as_json
 from fitting.infer.comparison import compare as compared_models
 from fitting.infer.comparison import rivals
 from fitting.infer.fit import fit as fit_tables
 from fitting.infer.result import FitResult
 from fitting.parameters import CONTACT_DEFAULT
-from fitting.report.report import summary, write_report
 from fitting.sampling.posterior import posterior as sampled_posterior
 from fitting.sampling.posterior import require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
@@ -122,8 +122,13 @@ def fit(  # noqa: PLR0913
 
 def _output(result: FitResult, extras: Mapping[str, Any]) -> Output:
     """Return what is handed out of a fit, with a comparison and a posterior where there are some."""
-    output = Output.of_report(result, partial(summary, result, **extras), partial(write_report, result, **extras))
-    return replace(output, payload={**output.payload, **{name: extra.to_dict() for name, extra in extras.items()}})
+    results = (result, *extras.values())
+    return Output.of(
+        result,
+        payload=as_json(result) | {name: as_json(extra) for name, extra in extras.items()},
+        text=[lambda: text_of(*results)],
+        report=partial(result.report, more=results[1:]),
+    )
 
 
 def parameters_of_contact(free: Sequence[str] | None, fixed: Mapping[str, float], no: Sequence[str]) -> dict[str, Any]:

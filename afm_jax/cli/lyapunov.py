@@ -4,7 +4,7 @@ from typing import Annotated
 
 from click import IntRange
 
-from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.command import Output
 from afm_jax.cli.scenes import NamedScene, ranges_of
 from afm_jax.cli.session import Session
 from afm_jax.dynamics.bands import drawn_exponents
@@ -53,4 +53,4 @@ def lyapunov(
     if not ranges:
         return Output.of(result._replace(larger_interval95=None if band is None else band[0]))
     result = result._replace(along=ranges[0], larger_interval95=band)
-    return Output.of(result, files={"lyapunov.png": picture_of("dynamics:exponents_figure", result)})
+    return Output.of(result, "lyapunov")

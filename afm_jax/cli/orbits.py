@@ -4,7 +4,7 @@ from typing import Annotated
 
 from click import IntRange
 
-from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.command import Output
 from afm_jax.cli.scenes import NamedScene, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
@@ -50,5 +50,4 @@ def orbits(
         with session.working("searching for orbits (the first run compiles for some seconds)"):
             search = contact_orbits if resolved else many_impact_orbits
             of_scene = search(scene.scene, order, impacts)
-    files = {"orbits.png": picture_of("dynamics:orbits_figure", of_scene)}
-    return Output.of(OrbitTable(scene.scene, order, of_scene, impacts), files=files)
+    return Output.of(OrbitTable(scene.scene, order, of_scene, impacts), "orbits")

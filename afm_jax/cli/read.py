@@ -1,6 +1,5 @@
 """`afm-jax read FILE`: tapping curves out of an instrument's file, as tables for `tapping` and `fit`."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,7 +7,7 @@ from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import CurveNumber, Quantity, Sensitivity
 from fitting.instruments.curve import read_curve, read_curves
-from fitting.instruments.report import curves_payload, curves_summary, write_tables
+from fitting.instruments.report import CurvesOfFile, write_tables
 
 
 class LeverOptions:
@@ -84,11 +83,5 @@ def curves_of_a_file(
         **reading: as `ReadingOptions` and `LeverOptions`.
     """
     curves = read_curves(file, **reading) if curve is None else [read_curve(file, curve=curve, **reading)]
-    refused = [each for each in curves if not each.valid]
-    numbers = ", ".join(str(each.curve) for each in refused)
-    return Output(
-        payload=curves_payload(curves),
-        text=[partial(curves_summary, curves)],
-        report=lambda path, _: write_tables(curves, path) if len(refused) < len(curves) else [],
-        not_valid=f"{file}: refused curve {numbers}; {refused[0].reasons[0]}" if refused else None,
-    )
+    usable = any(each.valid for each in curves)
+    return Output.of(CurvesOfFile(curves), report=lambda path: write_tables(curves, path) if usable else [])

@@ -3,16 +3,14 @@
 The `--out` folder is made and tried out before the computation.
 """
 
-import csv
 import functools
-import io
 import math
 import os
 import sys
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.columns import columns_of, csv_cells
+from afm_jax.columns import csv_text
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words, write_whole
-from afm_jax.words import lines_at_most, shown, text_table
+from afm_jax.words import lines_at_most, shown
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -164,32 +162,19 @@ class Session:
 
         Args:
             payload: the object; arrays become lists, NaN and infinity null.
-            text: strings, rich tables, and functions that return a string, one below the other; None: nothing. In a
-                terminal lines break between words, and tables that are too wide for it are turned.
+            text: results, parts of sections, and functions that return a string, one below the other; None: nothing. In
+                a terminal lines break between words, and tables that are too wide for it are turned.
         """
+        from afm_jax.report import lines_of  # noqa: PLC0415 (help needs no NumPy)
+
         if self.json:
             click.echo(in_callers_words(strict_json(labelled(payload))))
             return
-        console = _console(stderr=False)
-        with lines_at_most(console.width):
-            for part in (*text, *(f"Note: {note}" for note in _notes())):
-                if part is None:
-                    continue
-                words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
-                if is_text := isinstance(words, str):
-                    words = _broken(shown(in_callers_words(words)), console.width)
-                console.print(words, markup=not is_text, highlight=not is_text, soft_wrap=is_text)
-        sys.stdout.flush()
-
-    def write_table(self, name: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
-        """Write a table as CSV into the `--out` folder, if there is one, and say so.
-
-        Args:
-            name: file name, "orbits.csv".
-            rows: a mapping from column to value each; what is missing, None or not finite stays empty.
-            columns: the columns in order.
-        """
-        self.write_columns(name, columns_of(rows, columns))
+        width = _console(stderr=False).width
+        with lines_at_most(width):
+            lines = lines_of(*(part() if callable(part) else part for part in text))
+        for line in (*lines, *(f"Note: {note}" for note in _notes())):
+            click.echo(_broken(shown(in_callers_words(line)), width))
 
     def write_columns(self, name: str, columns: Mapping[str, Any], comments: Iterable[str] = ()) -> None:
         """Write a table as CSV into the `--out` folder, if there is one, and say so.
@@ -201,12 +186,7 @@ class Session:
         """
         if self.out is None:
             return
-        text = io.StringIO()
-        text.writelines(f"# {comment}\n" for comment in comments)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*map(csv_cells, columns.values()), strict=True))
-        write_whole(self.out / name, text.getvalue())
+        write_whole(self.out / name, csv_text(columns, comments))
         self.note(f"wrote {self.out / name}")
 
 
@@ -252,18 +232,6 @@ def _broken(text: str, width: int) -> str:
         hanging: dict[str, Any] = {"subsequent_indent": indent and f"{indent}  ", "break_long_words": False}
         lines += textwrap.wrap(line, width, **hanging, break_on_hyphens=False) if len(line) > width else [line]
     return "\n".join(lines).replace("\0", " ")
-
-
-def _table_text(console: Any, table: Any) -> Any:
-    """Return a table of rich; as the text of one that is turned, where the terminal is too narrow for it."""
-    from rich.measure import Measurement  # noqa: PLC0415
-
-    whole = console.options.update(width=WIDTH_OF_A_PIPE, max_width=WIDTH_OF_A_PIPE)
-    if Measurement.get(console, whole, table).maximum <= console.width:
-        return table
-    head = [str(column.header).replace("\n", " ") for column in table.columns]
-    rows = zip(*([str(cell) for cell in column.cells] for column in table.columns), strict=True)
-    return "\n".join([*([str(table.title)] if table.title else []), *text_table(head, list(rows))])
 
 
 def _console(*, stderr: bool) -> Any:

@@ -12,6 +12,7 @@ from afm_jax.cli.command import Output, later
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Orders, Positive, Share
+from afm_jax.columns import csv_columns
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.motion_table import MotionTable
 from afm_jax.motion.observe import observe
@@ -19,6 +20,7 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.settle import Window
 from afm_jax.motion.start import start_of
 from afm_jax.motion.trajectory import DensePath
+from afm_jax.saved import as_json
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 draw_motion = later("afm_jax.plots.motion:draw_motion")
@@ -99,13 +101,14 @@ def simulation(  # noqa: PLR0913
         seen = observe(scene.scene, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
     told = MotionTable(run, seen, dense, settings | {"longest_us": longest, "pieces": run.pieces})
 
-    def report(folder: Path, _: Any) -> Any:
+    def report(folder: Path) -> Any:
+        for name, columns in csv_columns(told).items():
+            session.write_columns(name, columns)
         if samples:
             _write_trace(session, dense, seen.window)
         return draw_motion(scene.scene, run.simulation, folder, verdict=run.verdict, dense=dense)
 
-    tables, payload = {} if session.out is None else told.tables(), told.to_dict()
-    return Output.of(told, payload=payload, tables=tables, json_file="simulate.json", report=report)
+    return Output.of(told, payload=as_json(told), json_file="simulate.json", report=report)
 
 
 def _check_duration(scene: Scene, duration_us: float) -> None:

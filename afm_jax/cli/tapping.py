@@ -1,20 +1,18 @@
 """`afm-jax tapping CURVE`: the energy of a tap, thresholds and hysteresis, and where the drive allows it the law."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import click
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.session import Session, add_note, prepare_folder
+from afm_jax.cli.session import Session, add_note
 from afm_jax.cli.values import CurveNumber, Share, option_of
+from afm_jax.saved import as_json
 from afm_jax.whole_files import check_plain
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
 from fitting.tapping_curves.measured import measured
-from fitting.tapping_curves.report import tapping_summary, together_summary, write_tapping, write_together
 from fitting.tapping_curves.tapping import energies_of_table, with_law
 from fitting.tapping_curves.together import together
 
@@ -72,28 +70,27 @@ def energy_of_taps(  # noqa: PLR0913
                 results[number] = with_law(result, model)
     if len(results) == 1 and not read.refused:
         (result,) = results
-        return Output.of_report(result, partial(tapping_summary, result), partial(write_tapping, result))
+        return Output.of(result, report=result.report)
     whole = together(results, read.refused)
     curves = dict(zip(read.tables, whole.curves, strict=True))
 
-    def write(folder: Path, _: Any) -> list[Path]:
+    def write(folder: Path) -> list[Path]:
         """Write a report of each curve into a folder of its own, and of all together if they scatter."""
         written: list[Path] = []
         for number, result in curves.items():
             below = folder / f"curve_{number}"
             check_plain(below)
-            prepare_folder(below)
-            written += write_tapping(result, below, replace(session, out=below).write_table)
-        return written + (write_together(whole, folder) if whole.scatter else [])
+            written += result.report(below)
+        return written + (whole.report(folder) if whole.scatter else [])
 
     return Output(
         payload={
             "valid": whole.valid,
-            "curves": [{"curve": number, **result.to_dict()} for number, result in curves.items()],
-            "together": whole.to_dict() if curves else None,
+            "curves": [{"curve": number, **as_json(result)} for number, result in curves.items()],
+            "together": as_json(whole) if curves else None,
             "refused": read.refused,
         },
-        text=[*(partial(tapping_summary, result) for result in curves.values()), partial(together_summary, whole)],
+        text=[*curves.values(), whole],
         report=write,
         not_valid=None if whole.valid else "; ".join(whole.reasons),
     )

@@ -1,6 +1,7 @@
 """`afm-jax tapping-map IMAGE`: energy of a tap and virial in every pixel."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,8 +9,7 @@ from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Positive, Quantity
 from fitting.instruments.images import read_images
-from fitting.report.sections import text_of
-from fitting.tapping_curves.map_report import map_report, write_map
+from fitting.tapping_curves.map_report import write_map
 from fitting.tapping_curves.maps import tapping_map
 
 
@@ -59,6 +59,4 @@ def map_of_an_image(
         **imaging: as `ImagingOptions` and `LeverOptions`.
     """
     result = tapping_map(read_images(image, columns=columns), **imaging)
-    return Output.of_report(
-        result, lambda: text_of(map_report(result)), lambda folder, _: write_map(result, folder, formats)
-    )
+    return Output.of(result, report=partial(write_map, result, formats=formats))

@@ -7,7 +7,7 @@ the end; `collisions` makes a table of them.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
-from rich.table import Table
 
 from afm_jax.checks import (
     as_parameter,
@@ -25,7 +24,7 @@ from afm_jax.checks import (
     refuse_float32,
     require_float64,
 )
-from afm_jax.columns import Cell, printed_table, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.contact.bridge_leg import (
     Passage,
     approach_through_bridge,
@@ -39,7 +38,9 @@ from afm_jax.contact.junction import Junction, find_junction, require_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import Result, ResultTuple, public_result
+from afm_jax.report import Cell, Section, sections, table_of
+from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.derivatives import by_tangents, implicit_root
 from afm_jax.solve.lanes import LANES, compiled_quickly, filled, for_each_lane, map_in_blocks
 
@@ -363,7 +364,8 @@ def _collided(contact: Contact, mass: Array, speeds: Array, setting: Setting) ->
     return (_careful if setting.careful else _quick)(contact, mass, speeds, setting=setting)
 
 
-class Collisions(NamedTuple):
+@public_result(picture="afm_jax.plots.collisions:collisions_figure")
+class Collisions(ResultTuple):
     """A table of collisions.
 
     Attributes:
@@ -375,9 +377,6 @@ class Collisions(NamedTuple):
     tips: Collision
     capture_speed_nm_per_us: float | None
     junction: dict[str, float]
-
-    text, plot = Result.text, Result.plot
-    _picture = "afm_jax.plots.collisions:collisions_figure"
 
     @property
     def columns(self) -> dict[str, list[Any]]:
@@ -404,52 +403,50 @@ class Collisions(NamedTuple):
         none_captured = "No tip is captured, however slow: the contact dissipates no energy."
         return None if self.capture_speed_nm_per_us else none_captured
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax collide`."""
-        return {
-            **self.columns,
-            "capture_speed_nm_per_us": self.capture_speed_nm_per_us,
-            "capture_speed_reason": self.capture_speed_reason,
-            "junction": self.junction,
-        }
 
-    def printed(self) -> list[str | Table]:
-        """Return the table of collisions, what their outcomes mean, the capture speed and the junction."""
-        cells: dict[str, Cell] = {
-            "approach\nnm/us": "approach_speed_nm_per_us",
-            "rebound\nnm/us": "rebound_speed_nm_per_us",
-            "delay\nus": "collision_delay_us",
-            "in junction\nus": "time_in_junction_us",
-            "deepest gap\nnm": "deepest_gap_nm",
-            "bridge\naJ lost": "bridge_hysteresis_aj",
-            "junction\naJ lost": "junction_hysteresis_aj",
-            "viscous\naJ lost": "viscous_loss_aj",
-            "outcome": "outcome_name",
-        }
-        title = "Collisions of a free tip with the sample at rest"
-        names = [CollisionOutcome(end).name.lower().replace("_", " ") for end in self.tips.outcome.tolist()]
-        columns = self.columns
-        rows = rows_of(columns | {"outcome_name": names})
-        parts: list[str | Table] = [printed_table(title, cells, rows[:_MOST_PRINTED])]
-        if len(rows) > _MOST_PRINTED:
-            which = f"The first {_MOST_PRINTED} of {len(rows)} collisions"
-            parts.append(f"{which}; the JSON object and collide.csv have all.")
-        parts += sorted(set(columns["outcome"]))
-        capture, junction = self.capture_speed_nm_per_us, self.junction
-        if all(columns["captured"]):
-            parts.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
-        parts.append(self.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
-        parts.append(
-            f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
-            f"{junction['breaks_gap_nm']:.4g} nm; hysteresis dissipates {junction['hysteresis_aj']:.4g} aJ: "
-            f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
-            "junction."
-        )
-        return parts
+@as_json.register
+def _(result: Collisions) -> dict[str, Any]:
+    names = ("capture_speed_nm_per_us", "capture_speed_reason", "junction")
+    return result.columns | {name: getattr(result, name) for name in names}
 
-    def tables(self) -> dict[str, dict[str, list[Any]]]:
-        """Return the columns of collide.csv, a row a tip."""
-        return {"collide.csv": self.columns}
+
+@sections.register
+def _(result: Collisions) -> list[Section]:
+    cells: dict[str, Cell] = {
+        "approach\nnm/us": "approach_speed_nm_per_us",
+        "rebound\nnm/us": "rebound_speed_nm_per_us",
+        "delay\nus": "collision_delay_us",
+        "in junction\nus": "time_in_junction_us",
+        "deepest gap\nnm": "deepest_gap_nm",
+        "bridge\naJ lost": "bridge_hysteresis_aj",
+        "junction\naJ lost": "junction_hysteresis_aj",
+        "viscous\naJ lost": "viscous_loss_aj",
+        "outcome": "outcome_name",
+    }
+    names = [CollisionOutcome(end).name.lower().replace("_", " ") for end in result.tips.outcome.tolist()]
+    columns = result.columns
+    rows = rows_of(columns | {"outcome_name": names})
+    parts: list[Any] = [table_of(cells, rows[:_MOST_PRINTED])]
+    if len(rows) > _MOST_PRINTED:
+        which = f"The first {_MOST_PRINTED} of {len(rows)} collisions"
+        parts.append(f"{which}; the JSON object and collide.csv have all.")
+    parts += sorted(set(columns["outcome"]))
+    capture, junction = result.capture_speed_nm_per_us, result.junction
+    if all(columns["captured"]):
+        parts.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
+    parts.append(result.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
+    parts.append(
+        f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
+        f"{junction['breaks_gap_nm']:.4g} nm; hysteresis dissipates {junction['hysteresis_aj']:.4g} aJ: "
+        f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
+        "junction."
+    )
+    return [Section("Collisions of a free tip with the sample at rest", parts)]
+
+
+@csv_columns.register
+def _(result: Collisions) -> CsvColumns:
+    return {"collide.csv": result.columns}
 
 
 _MOST_PRINTED = 40

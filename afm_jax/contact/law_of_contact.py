@@ -19,17 +19,16 @@ down to 0. The capture speed is where a rebound speed of 0 comes from.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
-from rich.table import Table
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import Cell, printed_table
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.bridge_leg import collocate, margin_of, pull_at, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Contact
@@ -38,7 +37,9 @@ from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw, closest_delay
-from afm_jax.results import Result, public_result
+from afm_jax.report import Cell, Section, sections, table_of
+from afm_jax.results import Result, ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.solve.least_squares import Sum, levenberg_marquardt
@@ -368,14 +369,13 @@ def delay_of_contact(
     return ContactDelay(law, approach, rebound, delay, lag, lag - delay, np.asarray(law(approach, rebound)))
 
 
-class ContactLaws(NamedTuple):
+@public_result()
+class ContactLaws(ResultTuple):
     """What `afm-jax collide --make-law` tells: the formulas closest to a contact, its delay, and its table."""
 
     formulas: list[ContactLaw]
     delay: ContactDelay
     law: TabulatedLaw
-
-    text = Result.text
 
     @property
     def reason(self) -> str | None:
@@ -383,59 +383,63 @@ class ContactLaws(NamedTuple):
         lost = [law.model for law in self.formulas if not law.converged]
         return f"the fit of {', '.join(lost)} did not converge; try another speed range" if lost else None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        first, delay = self.formulas[0], self.delay
-        return {
-            "residuals": "relative",
-            "speed_range_nm_per_us": first.speed_range,
-            "points": len(first.approach_speed_nm_per_us),
-            "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in self.formulas],
-            "contact_capture_speed_nm_per_us": first.contact_capture_speed_nm_per_us,
-            "delay": {
-                **{name: getattr(delay.delay, name) for name in _DELAY_NUMBERS},
-                "rms_us": delay.rms_us,
-                "worst_us": delay.worst_us,
-                "speed_range_nm_per_us": delay.speed_range,
-            },
-            "law": self.law.to_dict(),
-        }
 
-    def printed(self) -> list[str | Table]:
-        """Return a table of the formulas, and the formula of the delay."""
-        first, delay = self.formulas[0], self.delay
-        formulas: dict[str, Cell] = {
-            "law": "model",
-            "r\n": "r:.5f",
-            "epsilon\nnm^2/us^2": "epsilon:.5g",
-            "c\nnm/us": "viscous_loss:.3g",
-            "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
-            "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
-            "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
-        }
-        (low, high), (slow, fast) = first.speed_range, delay.speed_range
-        formula = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us"
-        numbers = ", ".join(f"{name} {float(getattr(delay.delay, name)):.4g}" for name in _DELAY_NUMBERS)
-        errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
-        return [
-            printed_table(f"{formula}, relative residuals", formulas, self.formulas),
-            f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
-            "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
-            "Delay law in us: hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
-            f"with {numbers}; {errors}, from {slow:.4g} to {fast:.4g} nm/us.",
-        ]
+@as_json.register
+def _(laws: ContactLaws) -> dict[str, Any]:
+    first, delay = laws.formulas[0], laws.delay
+    return {
+        "residuals": "relative",
+        "speed_range_nm_per_us": first.speed_range,
+        "points": len(first.approach_speed_nm_per_us),
+        "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in laws.formulas],
+        "contact_capture_speed_nm_per_us": first.contact_capture_speed_nm_per_us,
+        "delay": {
+            **{name: getattr(delay.delay, name) for name in _DELAY_NUMBERS},
+            "rms_us": delay.rms_us,
+            "worst_us": delay.worst_us,
+            "speed_range_nm_per_us": delay.speed_range,
+        },
+        "law": as_json(laws.law),
+    }
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of law_models.csv and of law_delay.csv, a row a speed."""
-        first = self.formulas[0]
-        models = {
-            "approach_speed_nm_per_us": first.approach_speed_nm_per_us,
-            "rebound_speed_nm_per_us": first.rebound_speed_nm_per_us,
-            **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in self.formulas},
-            **{f"{law.model}_relative_error": law.relative_error for law in self.formulas},
-        }
-        delays = {name: value for name, value in vars(self.delay).items() if name != "delay"}
-        return {"law_models.csv": models, "law_delay.csv": delays}
+
+@sections.register
+def _(laws: ContactLaws) -> list[Section]:
+    first, delay = laws.formulas[0], laws.delay
+    formulas: dict[str, Cell] = {
+        "law": "model",
+        "r": "r:.5f",
+        "epsilon\nnm^2/us^2": "epsilon:.5g",
+        "c\nnm/us": "viscous_loss:.3g",
+        "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
+        "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
+        "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
+    }
+    (low, high), (slow, fast) = first.speed_range, delay.speed_range
+    formula = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us"
+    numbers = ", ".join(f"{name} {float(getattr(delay.delay, name)):.4g}" for name in _DELAY_NUMBERS)
+    errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
+    parts = [
+        table_of(formulas, laws.formulas),
+        f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
+        "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
+        "Delay law in us: hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
+        f"with {numbers}; {errors}, from {slow:.4g} to {fast:.4g} nm/us.",
+    ]
+    return [Section(f"{formula}, relative residuals", parts)]
+
+
+@csv_columns.register
+def _(laws: ContactLaws) -> CsvColumns:
+    first = laws.formulas[0]
+    models = {
+        "approach_speed_nm_per_us": first.approach_speed_nm_per_us,
+        "rebound_speed_nm_per_us": first.rebound_speed_nm_per_us,
+        **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in laws.formulas},
+        **{f"{law.model}_relative_error": law.relative_error for law in laws.formulas},
+    }
+    delays = {name: value for name, value in vars(laws.delay).items() if name != "delay"}
+    return {"law_models.csv": models, "law_delay.csv": delays}
 
 
 _MODEL_KEYS = (

@@ -15,12 +15,14 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import columns_of, rows_of
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Tips, recorded
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
+from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.lanes import WIDTHS, Report, in_blocks
 from afm_jax.units import within_turn
 
@@ -47,7 +49,7 @@ class Attractor(NamedTuple):
     rebound_speed_nm_per_us: Float[np.ndarray, " impacts"] = np.zeros(0)
 
 
-@public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
+@public_result(picture="afm_jax.plots.dynamics:basins_figure")
 class Basins(ResultTuple):
     """The motions (attractors) on which the starts of a grid of drive phases and rebound speeds end.
 
@@ -70,10 +72,6 @@ class Basins(ResultTuple):
     share_error: Float[np.ndarray, " attractors"]
     share_interval95: Float[np.ndarray, "attractors 2"] | None = None
 
-    def table(self) -> list[dict[str, object]]:
-        """Return the rows of basins.csv, one a start: where it is, and the name of its attractor."""
-        return rows_of(self.tables()["basins.csv"])
-
     @property
     def reason(self) -> str | None:
         """Why the shares are not valid: some starts could not be followed; None where all were."""
@@ -87,63 +85,67 @@ class Basins(ResultTuple):
         """Approach speeds of the attractors' impacts."""
         return np.concatenate([attractor.approach_speed_nm_per_us for attractor in self.attractors])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax basins`."""
-        attractors = [
-            {
-                "name": attractor.name,
-                "impacts": attractor.impacts,
-                "periods": attractor.periods,
-                "share": share,
-                "share_error": error,
-                "phase_rad": attractor.phase_rad,
-                "velocity_after_nm_per_us": attractor.velocity_nm_per_us,
-            }
-            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
-        ]
-        if self.share_interval95 is not None:
-            for attractor, ends in zip(attractors, self.share_interval95.tolist(), strict=True):
-                attractor["share_interval95"] = ends
-        return {"starts": self.attractor.size, "attractors": attractors}
 
-    def printed(self) -> list[str]:
-        """Return what `afm-jax basins` prints, a line an attractor."""
-        speeds = self.rebound_speed_nm_per_us
-        box = f"{len(self.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
-        starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (`speeds_nm_per_us=...` chooses others)"
-        lines = []
-        for number, attractor in enumerate(self.attractors):
-            share, error = 100.0 * self.share[number], 100.0 * self.share_error[number]
-            lines.append(f"{attractor.name}: {share:.4g} +- {error:.2g} % of the starts")
-            if self.share_interval95 is not None:
-                low, high = 100.0 * self.share_interval95[number]
-                lines[-1] += f"; {low:.4g} to {high:.4g} % in 95 % of the draws"
-        if any(attractor.kind == MotionKind.IRREGULAR for attractor in self.attractors):
-            lines.append(
-                f"irregular: nothing repeated within {_LONG} impacts; with a high quality factor the motion may still "
-                "be settling (`afm-jax lyapunov --transient` follows one start for longer)"
-            )
-        return [starts, *lines]
-
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of basins.csv, a row a start, and of attractors.csv, a row an impact of an attractor."""
-        names = np.array([attractor.name for attractor in self.attractors])
-        phase, speed = np.meshgrid(self.phase_rad, self.rebound_speed_nm_per_us)
-        starts = {
-            "phase_rad": phase.ravel(),
-            "rebound_speed_nm_per_us": speed.ravel(),
-            "attractor": names[self.attractor.ravel()],
+@as_json.register
+def _(result: Basins) -> dict[str, Any]:
+    attractors = [
+        {
+            "name": attractor.name,
+            "impacts": attractor.impacts,
+            "periods": attractor.periods,
+            "share": share,
+            "share_error": error,
+            "phase_rad": attractor.phase_rad,
+            "velocity_after_nm_per_us": attractor.velocity_nm_per_us,
         }
-        points = [
-            {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
-            | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
-            for row in self.to_dict()["attractors"]
-            # an attractor without an impact has a row, too
-            for phase, velocity in zip(
-                row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
-            )
-        ]
-        return {"basins.csv": starts, "attractors.csv": columns_of(points)}
+        for attractor, share, error in zip(result.attractors, result.share, result.share_error, strict=True)
+    ]
+    if result.share_interval95 is not None:
+        for attractor, ends in zip(attractors, result.share_interval95.tolist(), strict=True):
+            attractor["share_interval95"] = ends
+    return {"starts": result.attractor.size, "attractors": attractors}
+
+
+@sections.register
+def _(result: Basins) -> list[Section]:
+    speeds = result.rebound_speed_nm_per_us
+    box = f"{len(result.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
+    starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (`speeds_nm_per_us=...` chooses others)"
+    lines = []
+    for number, attractor in enumerate(result.attractors):
+        share, error = 100.0 * result.share[number], 100.0 * result.share_error[number]
+        lines.append(f"{attractor.name}: {share:.4g} +- {error:.2g} % of the starts")
+        if result.share_interval95 is not None:
+            low, high = 100.0 * result.share_interval95[number]
+            lines[-1] += f"; {low:.4g} to {high:.4g} % in 95 % of the draws"
+    if any(attractor.kind == MotionKind.IRREGULAR for attractor in result.attractors):
+        lines.append(
+            f"irregular: nothing repeated within {_LONG} impacts; with a high quality factor the motion may still "
+            "be settling (`afm-jax lyapunov --transient` follows one start for longer)"
+        )
+    return [Section("", [starts, *lines])]
+
+
+@csv_columns.register
+def _(result: Basins) -> CsvColumns:
+    # a row a start, and a row an impact of an attractor
+    names = np.array([attractor.name for attractor in result.attractors])
+    phase, speed = np.meshgrid(result.phase_rad, result.rebound_speed_nm_per_us)
+    starts = {
+        "phase_rad": phase.ravel(),
+        "rebound_speed_nm_per_us": speed.ravel(),
+        "attractor": names[result.attractor.ravel()],
+    }
+    points = [
+        {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
+        | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
+        for row in as_json(result)["attractors"]
+        # an attractor without an impact has a row, too
+        for phase, velocity in zip(
+            row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
+        )
+    ]
+    return {"basins.csv": starts, "attractors.csv": columns_of(points)}
 
 
 @checked

@@ -8,7 +8,7 @@ flies away, begins anew at the next value, at the given start or where there is 
 """
 
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,16 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips
 from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Motions, Verdicts, motions_of
 from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import Result, ResultTuple, public_result
+from afm_jax.report import Section, sections
+from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
 from afm_jax.solve.lanes import LANES, Report
 from afm_jax.units import within_turn
@@ -66,67 +69,70 @@ class BifurcationDiagram(ResultTuple):
         """Whether the parameter rises or falls, in a word."""
         return "up" if self.upward else "down"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return one direction of the ramp as `afm-jax bifurcation --json` prints it."""
-        told = {
-            "direction": self.direction,
-            "complete": self.complete,
-            "values": self.values,
-            "verdicts": self.verdicts.names(),
-            "impacts": self.verdicts.impacts,
-            "periods": self.verdicts.periods,
-            "restarted": self.restarted,
-            "phase_rad": [row[np.isfinite(row)] for row in self.phase_rad],
-            "platform_height_nm": [row[np.isfinite(row)] for row in self.height_nm],
+
+@as_json.register
+def _(ramp: BifurcationDiagram) -> dict[str, Any]:
+    return _probability(ramp) | {
+        "direction": ramp.direction,
+        "complete": ramp.complete,
+        "values": ramp.values,
+        "verdicts": ramp.verdicts.names(),
+        "impacts": ramp.verdicts.impacts,
+        "periods": ramp.verdicts.periods,
+        "restarted": ramp.restarted,
+        "phase_rad": [row[np.isfinite(row)] for row in ramp.phase_rad],
+        "platform_height_nm": [row[np.isfinite(row)] for row in ramp.height_nm],
+    }
+
+
+def _probability(ramp: BifurcationDiagram) -> dict[str, np.ndarray]:
+    probability = ramp.verdict_probability
+    return {} if probability is None else {"verdict_probability": probability}
+
+
+@sections.register
+def _(ramp: BifurcationDiagram) -> list[Section]:
+    # the commonest kinds of motion
+    counts = Counter(ramp.verdicts.names()).most_common()
+    words = [f"{name} at {count}" for name, count in counts[:6]]
+    others = sum(count for _, count in counts[6:])
+    words += [f"others at {others}"] if others else []
+    return [Section("", [f"ramped {ramp.direction}: {', '.join(words)}"])]
+
+
+@csv_columns.register
+def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
+    # a row a value, an impact, and a height when the drive's phase is 0
+    verdicts = {"verdict": np.array(ramp.verdicts.names()), "restarted": ramp.restarted}
+    impacts = {
+        "phase_rad": ramp.phase_rad,
+        "approach_speed_nm_per_us": ramp.approach_nm_per_us,
+        "velocity_after_nm_per_us": ramp.velocity_after_nm_per_us,
+        "platform_height_nm": ramp.height_nm,
+    }
+    files = {
+        "bifurcation.csv": (verdicts | _probability(ramp), np.ones(len(ramp.values), bool)),
+        "impacts.csv": (impacts, np.isfinite(ramp.phase_rad)),
+        "strobe.csv": ({"height_nm": ramp.strobe_height_nm}, np.isfinite(ramp.strobe_height_nm)),
+    }
+    return {
+        file: {
+            "direction": np.full(there.sum(), ramp.direction),
+            parameter: np.repeat(ramp.values, there.reshape(len(ramp.values), -1).sum(axis=1)),
+            **{name: array[there] for name, array in arrays.items()},
         }
-        return told | self._probability
-
-    @property
-    def _probability(self) -> dict[str, np.ndarray]:
-        probability = self.verdict_probability
-        return {} if probability is None else {"verdict_probability": probability}
-
-    def printed(self) -> list[str]:
-        """Return a line with the commonest kinds of motion, and at how many values each is."""
-        counts = Counter(self.verdicts.names()).most_common()
-        words = [f"{name} at {count}" for name, count in counts[:6]]
-        others = sum(count for _, count in counts[6:])
-        return [f"ramped {self.direction}: " + ", ".join([*words, *([f"others at {others}"] if others else [])])]
-
-    def tables(self, parameter: str = "value") -> dict[str, dict[str, np.ndarray]]:
-        """Return the columns of three files: a row a value, an impact, and a height when the drive's phase is 0."""
-        verdicts = {"verdict": np.array(self.verdicts.names()), "restarted": self.restarted}
-        impacts = {
-            "phase_rad": self.phase_rad,
-            "approach_speed_nm_per_us": self.approach_nm_per_us,
-            "velocity_after_nm_per_us": self.velocity_after_nm_per_us,
-            "platform_height_nm": self.height_nm,
-        }
-        files = {
-            "bifurcation.csv": (verdicts | self._probability, np.ones(len(self.values), bool)),
-            "impacts.csv": (impacts, np.isfinite(self.phase_rad)),
-            "strobe.csv": ({"height_nm": self.strobe_height_nm}, np.isfinite(self.strobe_height_nm)),
-        }
-        return {
-            file: {
-                "direction": np.full(there.sum(), self.direction),
-                parameter: np.repeat(self.values, there.reshape(len(self.values), -1).sum(axis=1)),
-                **{name: array[there] for name, array in arrays.items()},
-            }
-            for file, (arrays, there) in files.items()
-        }
+        for file, (arrays, there) in files.items()
+    }
 
 
-class Ramps(NamedTuple):
+@public_result(picture="afm_jax.plots.dynamics:bifurcation_figure")
+class Ramps(ResultTuple):
     """What `afm-jax bifurcation` tells: a parameter, by its path, that is ramped up, down or both ways."""
 
     parameter: str
     sweeps: list[BifurcationDiagram]
     impacts_each: int
     """Impacts at each value."""
-
-    text, plot = Result.text, Result.plot
-    _picture = "afm_jax.plots.dynamics:bifurcation_figure"
 
     @property
     def reason(self) -> str | None:
@@ -142,31 +148,31 @@ class Ramps(NamedTuple):
         """Approach speeds of all impacts that were recorded."""
         return np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in self.sweeps])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        return {
-            "parameter": self.parameter,
-            "impacts_each": self.impacts_each,
-            "sweeps": [sweep.to_dict() for sweep in self.sweeps],
-        }
 
-    def printed(self) -> list[str]:
-        """Return a line a direction, and what irregular motions may be."""
-        lines = [line for sweep in self.sweeps for line in sweep.printed()]
-        if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in self.sweeps):
-            lines.append(
-                f"irregular: nothing repeated within the {self.impacts_each} impacts at a value; with a high quality "
-                "factor the motion may still be settling (`impacts=...` gives it more)"
-            )
-        return lines
+@as_json.register
+def _(ramps: Ramps) -> dict[str, Any]:
+    return ramps._asdict() | {"sweeps": [as_json(sweep) for sweep in ramps.sweeps]}
 
-    def tables(self) -> dict[str, dict[str, np.ndarray]]:
-        """Return the columns of three files, the directions one below the other."""
-        each = [sweep.tables(self.parameter) for sweep in self.sweeps]
-        return {
-            file: {name: np.concatenate([tables[file][name] for tables in each]) for name in columns}
-            for file, columns in each[0].items()
-        }
+
+@sections.register
+def _(ramps: Ramps) -> list[Section]:
+    parts = [part for ramp in ramps.sweeps for part in sections(ramp)[0].parts]
+    if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in ramps.sweeps):
+        parts.append(
+            f"irregular: nothing repeated within the {ramps.impacts_each} impacts at a value; with a high quality "
+            "factor the motion may still be settling (`impacts=...` gives it more)"
+        )
+    return [Section("", parts)]
+
+
+@csv_columns.register
+def _(ramps: Ramps) -> CsvColumns:
+    # the directions one below the other
+    each = [csv_columns(sweep, ramps.parameter) for sweep in ramps.sweeps]
+    return {
+        file: {name: np.concatenate([tables[file][name] for tables in each]) for name in columns}
+        for file, columns in each[0].items()
+    }
 
 
 @checked

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.checks import check_kind, checked
-from afm_jax.columns import rows_of
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -27,7 +27,9 @@ from afm_jax.dynamics.starts import SampleDriven, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
+from afm_jax.report import Section, sections
 from afm_jax.results import Result, public_result
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
 
@@ -153,7 +155,7 @@ def highest_orbits(
     return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 
 
-@public_result(picture="afm_jax.plots.dynamics:chart_figure", rows="table")
+@public_result(picture="afm_jax.plots.dynamics:chart_figure")
 @dataclass(frozen=True)
 class StabilityChart(Result):
     """A chart of stable admissible single-impact orbits over two parameters.
@@ -212,10 +214,6 @@ class StabilityChart(Result):
         """
         return self.stable[order - 1] & (self.x_values > 0.5 * order)
 
-    def table(self) -> list[dict[str, object]]:
-        """Return the rows of chart.csv, one a point."""
-        return rows_of(self.tables()["chart.csv"])
-
     @property
     def reason(self) -> str | None:
         """Why the chart is empty; None where an orbit is admissible."""
@@ -232,50 +230,53 @@ class StabilityChart(Result):
         speeds = self.verdicts.approach_speed_nm_per_us
         return () if speeds is None else speeds
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax chart`."""
-        verdicts, told = self.verdicts, {}
-        for axis, given in (("x", self.x), ("y", self.y)):
-            if given is not None:
-                told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
-        told |= {
-            "orders": list(range(1, self.orders + 1)),
-            "points": verdicts.stable.shape[1],
-            "admissible_share": verdicts.admissible.mean(axis=1),
-            "stable_share": verdicts.stable.mean(axis=1),
-            "any_stable_share": self.stable_share,
-            "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
-        }
-        if verdicts.unresolved is not None:
-            told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
-        if self.probability is not None:
-            told["uncertain_share"] = ((self.probability > 0.0) & (self.probability < 1.0)).mean(axis=1)
-        return told
-
-    def printed(self) -> list[str]:
-        """Return what `afm-jax chart` prints, a line an order."""
-        told = self.to_dict()
-        lines = [
-            f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
-            for order, stable, admissible in zip(
-                told["orders"], told["stable_share"], told["admissible_share"], strict=True
-            )
-        ]
-        return [*lines, f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points"]
-
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of chart.csv, a row a point."""
-        x, y = ("x" if self.x is None else self.x.path, "y" if self.y is None else self.y.path)
-        columns: dict[str, Any] = dict(zip((x, y), self.points(), strict=True))
-        columns["lowest_stable_order"] = self.lowest_stable_order.ravel()
-        names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
-        arrays = {name: getattr(self.verdicts, name) for name in names} | {"stable_probability": self.probability}
-        for order in range(self.orders):
-            columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
-        return {"chart.csv": columns}
-
     def _plane(self, rows: np.ndarray) -> np.ndarray:
         return rows.reshape(len(rows), len(self.y_values), len(self.x_values))
+
+
+@as_json.register
+def _(chart: StabilityChart) -> dict[str, Any]:
+    verdicts, told = chart.verdicts, {}
+    for axis, given in (("x", chart.x), ("y", chart.y)):
+        if given is not None:
+            told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+    told |= {
+        "orders": list(range(1, chart.orders + 1)),
+        "points": verdicts.stable.shape[1],
+        "admissible_share": verdicts.admissible.mean(axis=1),
+        "stable_share": verdicts.stable.mean(axis=1),
+        "any_stable_share": chart.stable_share,
+        "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
+    }
+    if verdicts.unresolved is not None:
+        told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
+    if chart.probability is not None:
+        told["uncertain_share"] = ((chart.probability > 0.0) & (chart.probability < 1.0)).mean(axis=1)
+    return told
+
+
+@sections.register
+def _(chart: StabilityChart) -> list[Section]:
+    told = as_json(chart)
+    shares = zip(told["orders"], told["stable_share"], told["admissible_share"], strict=True)
+    lines = [
+        f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
+        for order, stable, admissible in shares
+    ]
+    lines.append(f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points")
+    return [Section("", lines)]
+
+
+@csv_columns.register
+def _(chart: StabilityChart) -> CsvColumns:
+    x, y = ("x" if chart.x is None else chart.x.path, "y" if chart.y is None else chart.y.path)
+    columns: dict[str, Any] = dict(zip((x, y), chart.points(), strict=True))
+    columns["lowest_stable_order"] = chart.lowest_stable_order.ravel()
+    names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
+    arrays = {name: getattr(chart.verdicts, name) for name in names} | {"stable_probability": chart.probability}
+    for order in range(chart.orders):
+        columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
+    return {"chart.csv": columns}
 
 
 @checked

@@ -12,11 +12,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from rich.table import Table
 
 from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import Cell, columns_of, printed_table, rows_of
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
 from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
@@ -30,7 +29,9 @@ from afm_jax.dynamics.special_points import (
     special_points_of,
 )
 from afm_jax.impact.law import impact_law_of
+from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
@@ -62,7 +63,7 @@ _ENDS = {
 """In words why a branch ends."""
 
 
-@public_result(picture="afm_jax.plots.branches:continuation_figure", rows="points")
+@public_result(picture="afm_jax.plots.branches:continuation_figure")
 class Continuation(ResultTuple):
     """Orbits followed through a parameter, their special points, and curves of these in two parameters."""
 
@@ -83,10 +84,6 @@ class Continuation(ResultTuple):
     special_errors: Float[np.ndarray, " special"] | None = None
     """Standard errors of the parameter at the special points."""
 
-    def points(self) -> list[dict[str, Any]]:
-        """Return the rows of branches.csv, one a point."""
-        return rows_of(self.tables()["branches.csv"])
-
     @property
     def reason(self) -> str | None:
         """Why no point of the branches is an orbit that the tip flies; None where one is."""
@@ -105,102 +102,107 @@ class Continuation(ResultTuple):
         """Approach speeds of all impacts of all points."""
         return [speed for branch in self.branches for speed in branch.reading.approach_speed_nm_per_us.ravel().tolist()]
 
-    def _point_rows(self) -> list[dict[str, Any]]:
-        """Return the points of the branches as plain numbers, the first impact's and all impacts of each."""
-        rows = []
-        for number, branch in enumerate(self.branches):
-            for index, value in enumerate(branch.parameter.tolist()):
-                row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
-                if self.amplitude_errors is not None:
-                    error = float(self.amplitude_errors[number][index])
-                    row["peak_amplitude_error_nm"] = error if np.isfinite(error) else None
-                rows.append(row)
-        return rows
 
-    def _special_rows(self) -> list[dict[str, Any]]:
-        """Return the special points as plain numbers, with an interval where the law has errors."""
-        rows = []
-        for index, point in enumerate(self.special):
-            row = {
-                "kind": point.kind,
-                "parameter": point.parameter,
-                "branch": point.branch,
-                "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
-                "admissible": point.admissible,
-                "impacts": impact_rows(point.reading),
-            }
-            if self.special_errors is not None:
-                error = float(self.special_errors[index])
-                low, high = point.parameter - TWO_SIDED_95 * error, point.parameter + TWO_SIDED_95 * error
-                row |= {"parameter_error": error, "interval95": [low, high]}
+def _point_rows(result: Continuation) -> list[dict[str, Any]]:
+    """Return the points of the branches as plain numbers, the first impact's and all impacts of each."""
+    rows = []
+    for number, branch in enumerate(result.branches):
+        for index, value in enumerate(branch.parameter.tolist()):
+            row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
+            if result.amplitude_errors is not None:
+                error = float(result.amplitude_errors[number][index])
+                row["peak_amplitude_error_nm"] = error if np.isfinite(error) else None
             rows.append(row)
-        return rows
+    return rows
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax continue`."""
-        return {
-            "order": self.order,
-            "impacts": self.impacts,
-            "parameter": self.range.path,
-            "range": [self.range.low, self.range.high],
-            "second": None if self.second is None else self.second.path,
-            "points": self._point_rows(),
-            "special": self._special_rows(),
-            "curves": [
-                curve._asdict() | {"meetings": [meeting._asdict() for meeting in curve.meetings]}
-                for curve in self.curves
-            ],
-            "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in self.branches],
-            "law_parameters": None if self.law_parameters is None else list(self.law_parameters),
+
+def _special_rows(result: Continuation) -> list[dict[str, Any]]:
+    """Return the special points as plain numbers, with an interval where the law has errors."""
+    rows = []
+    for index, point in enumerate(result.special):
+        row = {
+            "kind": point.kind,
+            "parameter": point.parameter,
+            "branch": point.branch,
+            "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
+            "admissible": point.admissible,
+            "impacts": impact_rows(point.reading),
         }
+        if result.special_errors is not None:
+            error = float(result.special_errors[index])
+            low, high = point.parameter - TWO_SIDED_95 * error, point.parameter + TWO_SIDED_95 * error
+            row |= {"parameter_error": error, "interval95": [low, high]}
+        rows.append(row)
+    return rows
 
-    def printed(self) -> list[str | Table]:
-        """Return what `afm-jax continue` prints: a line a branch, a table of special points, lines for each curve."""
-        kind = f"({self.impacts}, {self.order}) orbits"
-        parts: list[str | Table] = [f"{'' if self.branches else 'No '}{kind} with {self.range}"]
-        for number, branch in enumerate(self.branches):
-            low, high = branch.parameter.min(), branch.parameter.max()
-            ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
-            count = len(branch.parameter)
-            parts.append(f"  branch {number}: {count} points between {low:.6g} and {high:.6g}; ends at {ends}")
-        if self.special:
-            cells: dict[str, Cell] = {
-                "kind": lambda row: row["kind"].replace("_", " "),
-                self.range.path: "parameter:.9g",
-                "peak\nnm": "peak_amplitude_nm:.5g",
-                "branch": "branch:d",
-                "admissible": "admissible",
-            }
-            if self.special_errors is not None:
-                cells["95 % interval"] = lambda row: "{:.5g} to {:.5g}".format(*row["interval95"])
-            parts.append(printed_table("Special points", cells, self._special_rows()))
-        for curve in self.curves:
-            ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
-            parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
-            parts += [
-                f"    {meeting.kind.replace('_', ' ')} at ({meeting.parameter:.6g}, {meeting.second:.6g})"
-                for meeting in curve.meetings
-            ]
-        return parts
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of files: points, their impacts if there are several, special points, and curves."""
-        points, special = self._point_rows(), self._special_rows()
-        tables = {"branches.csv": columns_of(points, _POINT_COLUMNS)}
-        if self.impacts > 1:
-            impacts = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
-            tables["impacts.csv"] = columns_of(impacts, ("point", *IMPACT_COLUMNS))
-        for row in special:
-            row["interval95_low"], row["interval95_high"] = row.get("interval95", (None, None))
-        tables["special.csv"] = columns_of(special, _SPECIAL_COLUMNS)
-        if self.second is not None:
-            curves = [
-                {"curve": k, "kind": curve.kind, "parameter": p, "second": q, "admissible": flown}
-                for k, curve in enumerate(self.curves)
-                for p, q, flown in zip(curve.parameter, curve.second, curve.admissible, strict=True)
-            ]
-            tables["curves.csv"] = columns_of(curves, ("curve", "kind", "parameter", "second", "admissible"))
-        return tables
+@as_json.register
+def _(result: Continuation) -> dict[str, Any]:
+    return {
+        "order": result.order,
+        "impacts": result.impacts,
+        "parameter": result.range.path,
+        "range": [result.range.low, result.range.high],
+        "second": None if result.second is None else result.second.path,
+        "points": _point_rows(result),
+        "special": _special_rows(result),
+        "curves": [
+            curve._asdict() | {"meetings": [meeting._asdict() for meeting in curve.meetings]} for curve in result.curves
+        ],
+        "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in result.branches],
+        "law_parameters": result.law_parameters,
+    }
+
+
+@sections.register
+def _(result: Continuation) -> list[Section]:
+    parts: list[Any] = []
+    for number, branch in enumerate(result.branches):
+        low, high = branch.parameter.min(), branch.parameter.max()
+        ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
+        count = len(branch.parameter)
+        parts.append(f"  branch {number}: {count} points between {low:.6g} and {high:.6g}; ends at {ends}")
+    if result.special:
+        cells: dict[str, Cell] = {
+            "kind": lambda row: row["kind"].replace("_", " "),
+            result.range.path: "parameter:.9g",
+            "peak\nnm": "peak_amplitude_nm:.5g",
+            "branch": "branch:d",
+            "admissible": "admissible",
+        }
+        if result.special_errors is not None:
+            cells["95 % interval"] = lambda row: "{:.5g} to {:.5g}".format(*row["interval95"])
+        parts += ["Special points", table_of(cells, _special_rows(result))]
+    for curve in result.curves:
+        ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
+        parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
+        parts += [
+            f"    {meeting.kind.replace('_', ' ')} at ({meeting.parameter:.6g}, {meeting.second:.6g})"
+            for meeting in curve.meetings
+        ]
+    kind = f"({result.impacts}, {result.order}) orbits"
+    return [Section(f"{'' if result.branches else 'No '}{kind} with {result.range}", parts)]
+
+
+@csv_columns.register
+def _(result: Continuation) -> CsvColumns:
+    # points, their impacts if there are several, special points, and curves
+    points, special = _point_rows(result), _special_rows(result)
+    tables = {"branches.csv": columns_of(points, _POINT_COLUMNS)}
+    if result.impacts > 1:
+        impacts = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
+        tables["impacts.csv"] = columns_of(impacts, ("point", *IMPACT_COLUMNS))
+    for row in special:
+        row["interval95_low"], row["interval95_high"] = row.get("interval95", (None, None))
+    tables["special.csv"] = columns_of(special, _SPECIAL_COLUMNS)
+    if result.second is not None:
+        curves = [
+            {"curve": k, "kind": curve.kind, "parameter": p, "second": q, "admissible": flown}
+            for k, curve in enumerate(result.curves)
+            for p, q, flown in zip(curve.parameter, curve.second, curve.admissible, strict=True)
+        ]
+        tables["curves.csv"] = columns_of(curves, ("curve", "kind", "parameter", "second", "admissible"))
+    return tables
 
 
 @checked

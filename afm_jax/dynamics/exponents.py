@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import multipliers_of
 from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, Record, Tips, follow, next_departures
@@ -25,7 +26,9 @@ from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.words import counted, with_error
@@ -66,7 +69,7 @@ class Lyapunov(ResultTuple):
     @property
     def reason(self) -> str | None:
         """Why there are no exponents at all; None where there are some."""
-        motions = self._motions()
+        motions = _motions(self)
         if not np.isnan(motions.exponents_per_impact[:, 0]).all():
             return None
         words = "; ".join(dict.fromkeys(exponent_verdicts(motions)))
@@ -77,69 +80,70 @@ class Lyapunov(ResultTuple):
         """Approach speeds of the last impacts."""
         return self.approach_speed_nm_per_us
 
-    def _motions(self) -> "Lyapunov":
-        """Return the exponents of many motions; those of one as a batch of one."""
-        return self if np.ndim(self.impacts) else jax.tree.map(lambda array: np.asarray(array)[None], self)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax lyapunov`: numbers of one motion, lists of many."""
-        many, verdicts = np.ndim(self.impacts) > 0, exponent_verdicts(self._motions())
-        told = {
-            "exponents_per_us": self.exponents_per_us,
-            "exponents_per_impact": self.exponents_per_impact,
-            "exponents_per_us_error": self.exponents_per_us_error,
-            "exponents_per_impact_error": self.exponents_per_impact_error,
-            "impacts": self.impacts,
-            "rested": self.rested,
-            "orbit": {"impacts": self.verdicts.impacts, "periods": self.verdicts.periods},
-            "verdict": verdicts if many else verdicts[0],
-        }
-        if self.larger_interval95 is not None:
-            told["exponent_per_impact_interval95"] = self.larger_interval95
-        return told if self.along is None else told | {"parameter": self.along.path, "values": self.along.values}
+def _motions(result: Lyapunov) -> Lyapunov:
+    """Return the exponents of many motions; those of one as a batch of one."""
+    return result if np.ndim(result.impacts) else jax.tree.map(lambda array: np.asarray(array)[None], result)
 
-    def printed(self) -> list[str]:
-        """Return the exponents of one motion with their errors; of many how many are positive."""
-        larger, error = self.exponents_per_impact[..., 0], self.exponents_per_impact_error[..., 0]
-        if np.ndim(self.impacts):
-            positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
-            unknown = int(np.sum(np.isnan(larger)))
-            what, others = self.along or counted(larger.size, "motion"), larger.size - unknown - positive
-            verdict = f"negative or undecided at {others}, unknown at {unknown}"
-            return [f"{what}: the larger exponent is positive at {positive} values, {verdict}"]
 
-        def pair(values: np.ndarray, errors: np.ndarray) -> str:
-            pairs = zip(values, errors, strict=True)
-            return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in pairs)
+@as_json.register
+def _(result: Lyapunov) -> dict[str, Any]:
+    # numbers of one motion, lists of many
+    names = ("exponents_per_us", "exponents_per_impact", "exponents_per_us_error", "exponents_per_impact_error")
+    verdicts = exponent_verdicts(_motions(result))
+    told = {name: getattr(result, name) for name in (*names, "impacts", "rested")} | {
+        "orbit": {"impacts": result.verdicts.impacts, "periods": result.verdicts.periods},
+        "verdict": verdicts if np.ndim(result.impacts) else verdicts[0],
+    }
+    if result.larger_interval95 is not None:
+        told["exponent_per_impact_interval95"] = result.larger_interval95
+    return told if result.along is None else told | {"parameter": result.along.path, "values": result.along.values}
 
-        lines = [
-            f"Lyapunov exponents per impact: {pair(self.exponents_per_impact, self.exponents_per_impact_error)}",
-            f"                       per us: {pair(self.exponents_per_us, self.exponents_per_us_error)}",
-            f"{int(self.impacts)} impacts; {exponent_verdicts(self._motions())[0]}",
-        ]
-        if self.larger_interval95 is not None:
-            low, high = self.larger_interval95
-            lines.append(f"the larger per impact: {low:.6g} to {high:.6g} in 95 % of the draws")
-        return lines
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of lyapunov.csv, a row a motion."""
-        motions = self._motions()
-        columns: dict[str, Any] = {} if self.along is None else {self.along.path: self.along.values}
-        columns |= {
-            "exponent_per_impact": motions.exponents_per_impact[:, 0],
-            "second_exponent_per_impact": motions.exponents_per_impact[:, 1],
-            "exponent_per_impact_error": motions.exponents_per_impact_error[:, 0],
-            "exponent_per_us": motions.exponents_per_us[:, 0],
-            "second_exponent_per_us": motions.exponents_per_us[:, 1],
-            "impacts": motions.impacts,
-            "rested": motions.rested,
-            "verdict": exponent_verdicts(motions),
-        }
-        if motions.larger_interval95 is not None:
-            low, high = motions.larger_interval95.T
-            columns |= {"exponent_per_impact_low": low, "exponent_per_impact_high": high}
-        return {"lyapunov.csv": columns}
+@sections.register
+def _(result: Lyapunov) -> list[Section]:
+    # the exponents of one motion with their errors; of many how many are positive
+    larger, error = result.exponents_per_impact[..., 0], result.exponents_per_impact_error[..., 0]
+    if np.ndim(result.impacts):
+        positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
+        unknown = int(np.sum(np.isnan(larger)))
+        what, others = result.along or counted(larger.size, "motion"), larger.size - unknown - positive
+        verdict = f"negative or undecided at {others}, unknown at {unknown}"
+        return [Section("", [f"{what}: the larger exponent is positive at {positive} values, {verdict}"])]
+
+    def pair(values: np.ndarray, errors: np.ndarray) -> str:
+        pairs = zip(values, errors, strict=True)
+        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in pairs)
+
+    lines = [
+        f"Lyapunov exponents per impact: {pair(result.exponents_per_impact, result.exponents_per_impact_error)}",
+        f"                       per us: {pair(result.exponents_per_us, result.exponents_per_us_error)}",
+        f"{int(result.impacts)} impacts; {exponent_verdicts(_motions(result))[0]}",
+    ]
+    if result.larger_interval95 is not None:
+        low, high = result.larger_interval95
+        lines.append(f"the larger per impact: {low:.6g} to {high:.6g} in 95 % of the draws")
+    return [Section("", lines)]
+
+
+@csv_columns.register
+def _(result: Lyapunov) -> CsvColumns:
+    motions = _motions(result)
+    columns: dict[str, Any] = {} if result.along is None else {result.along.path: result.along.values}
+    columns |= {
+        "exponent_per_impact": motions.exponents_per_impact[:, 0],
+        "second_exponent_per_impact": motions.exponents_per_impact[:, 1],
+        "exponent_per_impact_error": motions.exponents_per_impact_error[:, 0],
+        "exponent_per_us": motions.exponents_per_us[:, 0],
+        "second_exponent_per_us": motions.exponents_per_us[:, 1],
+        "impacts": motions.impacts,
+        "rested": motions.rested,
+        "verdict": exponent_verdicts(motions),
+    }
+    if motions.larger_interval95 is not None:
+        low, high = motions.larger_interval95.T
+        columns |= {"exponent_per_impact_low": low, "exponent_per_impact_high": high}
+    return {"lyapunov.csv": columns}
 
 
 CHAOTIC_ERRORS = 3.0

@@ -4,21 +4,17 @@ An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several imp
 one's numbers besides (`orbit_facts`).
 """
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-from rich.table import Table
+from typing import Any
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
 from afm_jax.impact.orbits import SingleImpactOrbits
-from afm_jax.results import Result
+from afm_jax.report import Cell, Section, Table, sections, table_of
+from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.words import counted
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _IMPACT_CELLS: dict[str, Cell] = {
     "phase\nrad": "phase_rad",
@@ -29,7 +25,8 @@ _IMPACT_CELLS: dict[str, Cell] = {
 }
 
 
-class OrbitTable(NamedTuple):
+@public_result(picture="afm_jax.plots.dynamics:orbits_figure")
+class OrbitTable(ResultTuple):
     """The orbits of one scene of order N: of a law's those of one impact, or with `impacts` those of several."""
 
     scene: Scene
@@ -37,23 +34,17 @@ class OrbitTable(NamedTuple):
     orbits: SingleImpactOrbits | ManyImpactOrbits
     impacts: int | None = None
 
-    text = Result.text
-
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
-        return self.orbits.plot(path)
-
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The orbits that exist as plain numbers: by rising approach speed, or each with all its impacts."""
         if isinstance(self.orbits, ManyImpactOrbits):
             return [orbit_facts(self.orbits.reading, index) for index in range(len(self.orbits.stable))]
-        columns = {name: getattr(self.orbits, name).tolist() for name in self._columns}
+        columns = {name: getattr(self.orbits, name).tolist() for name in self.columns}
         slots = [slot for slot, exists in enumerate(self.orbits.exists.tolist()) if exists]
         return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
     @property
-    def _columns(self) -> tuple[str, ...]:
+    def columns(self) -> tuple[str, ...]:
         """What is told in a row of an orbit: attributes of orbits of such a scene; of several impacts the first's."""
         if self.impacts is not None:
             return (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
@@ -81,56 +72,60 @@ class OrbitTable(NamedTuple):
         """Approach speed of each impact of each orbit."""
         return [impact["approach_speed_nm_per_us"] for orbit in self.rows for impact in orbit.get("impacts", [orbit])]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        orbits = self.orbits
-        several = isinstance(orbits, ManyImpactOrbits)
-        more = {"impacts": self.impacts} if several else {"complete": orbits.complete}
-        return {"order": self.order, "orbits": self.rows} | more
 
-    def printed(self) -> list[str | Table]:
-        """Return the orbits as a table; where base or force drive with what is read at the drive's frequency."""
-        rows = self.rows
-        if self.impacts is not None:
-            return [self._printed_impacts(rows, self.impacts)]
-        cells: dict[str, Cell] = {**_IMPACT_CELLS, "peak\nnm": "peak_amplitude_nm"}
-        if rows and "drive_lockin_amplitude_nm" in rows[0]:
-            cells |= {"at drive\nnm": "drive_lockin_amplitude_nm", "at drive\ndeg": "drive_lockin_phase_deg"}
-            if "peak_deflection_nm" in rows[0]:
-                cells["deflection\nat drive nm"] = "deflection_drive_lockin_amplitude_nm"
-            cells["lag\ndeg"] = "phase_lag_deg"
-        else:
-            cells |= {"lock-in\nnm": "lockin_amplitude_nm", "lock-in\ndeg": "lockin_phase_deg"}
-        cells |= {"trace": "trace", "determinant": "determinant", "stable": "stable", "admissible": "admissible"}
-        title = f"Orbits with one impact in {counted(self.order, 'drive period')}"
-        parts: list[str | Table] = [printed_table(title, cells, rows)]
-        if any(orbit["near_double"] for orbit in rows):
-            parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
-        return parts
+@as_json.register
+def _(table: OrbitTable) -> dict[str, Any]:
+    orbits = table.orbits
+    several = isinstance(orbits, ManyImpactOrbits)
+    more = {"impacts": table.impacts} if several else {"complete": orbits.complete}
+    return {"order": table.order, "orbits": table.rows} | more
 
-    def _printed_impacts(self, orbits: list[dict[str, Any]], impacts: int) -> Table:
-        """Return the orbits as a table, a line an impact."""
-        rows = [{**orbit, **impact, "orbit": k} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
-        cells: dict[str, Cell] = {
-            "orbit": "orbit:d",
-            **_IMPACT_CELLS,
-            "peak\nnm": "peak_amplitude_nm",
-            "multipliers": lambda row: ", ".join(f"{complex(*z) if z[1] else z[0]:.4g}" for z in row["multipliers"]),
-            "stable": "stable",
-        }
-        title = f"Orbits with {counted(impacts, 'impact')} in {counted(self.order, 'drive period')}"
-        return printed_table(title, cells, rows)
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of orbits.csv, a row an orbit, and of several impacts of impacts.csv, a row an impact."""
-        orbits = self.rows
-        if self.impacts is None:
-            return {"orbits.csv": columns_of(orbits, self._columns)}
-        impacts = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
-        return {
-            "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], self._columns),
-            "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
-        }
+@sections.register
+def _(table: OrbitTable) -> list[Section]:
+    # where base or force drive with what is read at the drive's frequency
+    rows, periods = table.rows, counted(table.order, "drive period")
+    if table.impacts is not None:
+        return [Section(f"Orbits with {counted(table.impacts, 'impact')} in {periods}", [_impacts_of(rows)])]
+    cells: dict[str, Cell] = {**_IMPACT_CELLS, "peak\nnm": "peak_amplitude_nm"}
+    if rows and "drive_lockin_amplitude_nm" in rows[0]:
+        cells |= {"at drive\nnm": "drive_lockin_amplitude_nm", "at drive\ndeg": "drive_lockin_phase_deg"}
+        if "peak_deflection_nm" in rows[0]:
+            cells["deflection\nat drive nm"] = "deflection_drive_lockin_amplitude_nm"
+        cells["lag\ndeg"] = "phase_lag_deg"
+    else:
+        cells |= {"lock-in\nnm": "lockin_amplitude_nm", "lock-in\ndeg": "lockin_phase_deg"}
+    cells |= {"trace": "trace", "determinant": "determinant", "stable": "stable", "admissible": "admissible"}
+    parts: list[Any] = [table_of(cells, rows)]
+    if any(orbit["near_double"] for orbit in rows):
+        parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
+    return [Section(f"Orbits with one impact in {periods}", parts)]
+
+
+def _impacts_of(orbits: list[dict[str, Any]]) -> Table:
+    """Return orbits as a table, a line an impact."""
+    rows = [{**orbit, **impact, "orbit": k} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
+    cells: dict[str, Cell] = {
+        "orbit": "orbit:d",
+        **_IMPACT_CELLS,
+        "peak\nnm": "peak_amplitude_nm",
+        "multipliers": lambda row: ", ".join(f"{complex(*z) if z[1] else z[0]:.4g}" for z in row["multipliers"]),
+        "stable": "stable",
+    }
+    return table_of(cells, rows)
+
+
+@csv_columns.register
+def _(table: OrbitTable) -> CsvColumns:
+    # a row an orbit; of several impacts also a row an impact
+    orbits = table.rows
+    if table.impacts is None:
+        return {"orbits.csv": columns_of(orbits, table.columns)}
+    impacts = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
+    return {
+        "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], table.columns),
+        "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
+    }
 
 
 def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> str:

@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
+from afm_jax.saved import as_json
 from afm_jax.solve.derivatives import implicit_root, slope_of
 from afm_jax.strict_json import plain
 
@@ -524,26 +525,6 @@ class TabulatedLaw(Law):
         """How many independent unknowns its errors have; 0 where nothing is known of them."""
         return 0 if self.deviations is None else self.deviations["capture"].shape[-1 if self.capture.ndim else 0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
-        # a program for laws of however many unknowns
-        found = _at_knots(_replaced(self, deviations=None))
-        numbers = {name: getattr(self, name) for name in _NUMBERS}
-        told: dict[str, Any] = {
-            "approach_speed_nm_per_us": found.approach,
-            "rebound_speed_nm_per_us": found.rebound,
-            "capture_speed_nm_per_us": self.capture,
-            "speed_range_nm_per_us": [self.slowest_nm_per_us, self.fastest_nm_per_us],
-            "mass_ng": self.mass_ng,
-            "origin": self.origin.text or None,
-            "numbers": numbers,
-            "deviations": self.deviations,
-        }
-        if self.delay is not None:
-            told |= {"collision_delay_us": found.delay, "corrections": self.delay.corrections}
-            numbers |= {name: getattr(self.delay, name) for name in _OF_DELAY}
-        return {name: plain(value) for name, value in told.items() if value is not None}
-
     def __repr__(self) -> str:
         """Return what the law is of, without its splines."""
         end = self.slowest_nm_per_us
@@ -650,8 +631,30 @@ def _replaced(law: TabulatedLaw | None, **parts: Any) -> TabulatedLaw:
     return made
 
 
+@as_json.register
+def _(law: TabulatedLaw) -> dict[str, Any]:
+    """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
+    # a program for laws of however many unknowns
+    found = _at_knots(_replaced(law, deviations=None))
+    numbers = {name: getattr(law, name) for name in _NUMBERS}
+    told: dict[str, Any] = {
+        "approach_speed_nm_per_us": found.approach,
+        "rebound_speed_nm_per_us": found.rebound,
+        "capture_speed_nm_per_us": law.capture,
+        "speed_range_nm_per_us": [law.slowest_nm_per_us, law.fastest_nm_per_us],
+        "mass_ng": law.mass_ng,
+        "origin": law.origin.text or None,
+        "numbers": numbers,
+        "deviations": law.deviations,
+    }
+    if law.delay is not None:
+        told |= {"collision_delay_us": found.delay, "corrections": law.delay.corrections}
+        numbers |= {name: getattr(law.delay, name) for name in _OF_DELAY}
+    return {name: plain(value) for name, value in told.items() if value is not None}
+
+
 def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
-    """Return the law that `TabulatedLaw.to_dict` tells, number for number, or of a table with columns of these names.
+    """Return the law that `as_json` of one tells, number for number, or of a table with columns of these names.
 
     Raises:
         ValueError: if columns are missing or are no table of a law.

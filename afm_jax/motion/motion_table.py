@@ -2,18 +2,21 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from afm_jax.apparatus.scene import drive_of
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.follow import LongRun
 from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
-from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
+from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.trajectory import DensePath
-from afm_jax.results import Result, known_columns
+from afm_jax.report import Section, sections
+from afm_jax.results import ResultTuple, known_columns, public_result
+from afm_jax.saved import as_json
 from afm_jax.words import counted
 
 _WHOLE_PERIODS = 50
@@ -24,7 +27,8 @@ _MOST_NODES = 100_000
 """Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
 
 
-class MotionTable(NamedTuple):
+@public_result()
+class MotionTable(ResultTuple):
     """A scene that was followed, and what an instrument reads of it."""
 
     run: LongRun
@@ -33,88 +37,96 @@ class MotionTable(NamedTuple):
     """The tip at any time."""
     settings: Mapping[str, Any]
 
-    text = Result.text
-
     @property
     def reason(self) -> str | None:
         """Why the simulation broke off; None where it did not."""
         return self.run.simulation.broke_off
 
-    def _extrapolated(self) -> str | None:
+    @property
+    def extrapolated(self) -> str | None:
+        """Which impacts come outside the speeds that the law is known for; None where none does."""
         speeds = self.run.simulation.contacts.approach_speed_nm_per_us
         return extrapolation_of(self.dense.scene.interaction, speeds)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax simulate`, without the scene; what is null has its reason beside it."""
-        simulation, verdict, seen = self.run.simulation, self.run.verdict, self.seen
-        extrapolated, reasons = self._extrapolated(), why_absent(self.dense.scene, seen)
-        if extrapolated is None:
-            reasons["extrapolated"] = "No impact is faster or slower than the law is known for."
-        if verdict.periods is None:
-            reasons["order"] = reasons["contacts_per_response"] = verdict.reason
-        if verdict.remaining is None:
-            reasons["remaining_distance"] = "the tip is held" if verdict.stuck else verdict.reason
-        deflection = seen.deflection_harmonics
-        return {
-            "impacts": int(simulation.count),
-            "stuck": verdict.stuck,
-            "settled": verdict.settled,
-            "order": verdict.periods,
-            "contacts_per_response": verdict.contacts,
-            "settled_reason": verdict.reason,
-            "remaining_distance": verdict.remaining,
-            **{name: getattr(seen, name) for name in OBSERVABLES},
-            "drive_frequency_khz": seen.drive_frequency_khz,
-            "response_frequency_khz": seen.response_frequency_khz,
-            "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
-            "deflection_harmonics": deflection and [harmonic._asdict() for harmonic in deflection],
-            "window": {**seen.window._asdict(), "contacts": seen.contacts},
-            "null_reasons": reasons,
-            "start": {name: float(value) for name, value in simulation.start._asdict().items()},
-            "final": {
-                **{name: float(value) for name, value in simulation.final._asdict().items()},
-                "phase": ContactPhase(int(simulation.phase)).name.lower(),
-            },
-            "outcome": MotionOutcome(int(simulation.outcome)).sentence,
-            "valid": self.reason is None,
-            "settings": dict(self.settings),
-            "extrapolated": extrapolated,
-        }
 
-    def printed(self) -> list[str | None]:
-        """Return a short summary, a line each."""
-        simulation, seen, verdict, window = self.run.simulation, self.seen, self.run.verdict, self.seen.window
-        begin, final, phase = simulation.start, simulation.final, ContactPhase(int(simulation.phase)).name.lower()
-        times, mean = f"{float(begin.time_us):.6g} to {float(final.time_us):.6g}", ""
-        reading = ["Less than a response period: no means, energies, amplitudes and phases; follow the motion longer."]
-        if window.responses:
-            mean, reading = f"mean height {seen.mean_height_nm:.6g} nm, ", _over_a_response(seen)
-        position, velocity = f"{float(final.position_nm):.6g} nm", f"{float(final.velocity_nm_per_us):.6g} nm/us"
-        read = f"{window.from_us:.6g} to {window.to_us:.6g}"
-        return [
-            f"{counted(int(simulation.count), 'contact')} from {times} us.",
-            f"{'Settled' if verdict.settled else 'Not settled'}: {verdict.reason}.",
-            f"Peak amplitude {seen.peak_amplitude_nm:.6g} nm, {mean}from {read} us.",
-            *reading,
-            f"At the end: {position}, {velocity}, {phase}{'; the sample holds the tip' if verdict.stuck else ''}.",
-            self._extrapolated(),
-        ]
+@as_json.register
+def _(result: MotionTable) -> dict[str, Any]:
+    # without the scene; what is null has its reason beside it
+    simulation, verdict, seen = result.run.simulation, result.run.verdict, result.seen
+    extrapolated, reasons = result.extrapolated, why_absent(result.dense.scene, seen)
+    if extrapolated is None:
+        reasons["extrapolated"] = "No impact is faster or slower than the law is known for."
+    if verdict.periods is None:
+        reasons["order"] = reasons["contacts_per_response"] = verdict.reason
+    if verdict.remaining is None:
+        reasons["remaining_distance"] = "the tip is held" if verdict.stuck else verdict.reason
+    deflection = seen.deflection_harmonics
+    return {
+        "impacts": int(simulation.count),
+        "stuck": verdict.stuck,
+        "settled": verdict.settled,
+        "order": verdict.periods,
+        "contacts_per_response": verdict.contacts,
+        "settled_reason": verdict.reason,
+        "remaining_distance": verdict.remaining,
+        **{name: getattr(seen, name) for name in OBSERVABLES},
+        "drive_frequency_khz": seen.drive_frequency_khz,
+        "response_frequency_khz": seen.response_frequency_khz,
+        "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
+        "deflection_harmonics": deflection and [harmonic._asdict() for harmonic in deflection],
+        "window": {**seen.window._asdict(), "contacts": seen.contacts},
+        "null_reasons": reasons,
+        "start": simulation.start._asdict(),
+        "final": simulation.final._asdict() | {"phase": ContactPhase(int(simulation.phase)).name.lower()},
+        "outcome": MotionOutcome(int(simulation.outcome)).sentence,
+        "valid": result.reason is None,
+        "settings": dict(result.settings),
+        "extrapolated": extrapolated,
+    }
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of contacts.csv, a row a contact, and of trajectory.csv, dense in contacts.
 
-        The tip is written down over a short simulation as a whole, else over the window of the observables.
-        """
-        simulation, window = self.run.simulation, self.seen.window
-        begin, end = float(simulation.start.time_us), float(simulation.final.time_us)
-        if end - begin > _WHOLE_PERIODS * drive_of(self.dense.scene).period_us:
-            begin, end = window.from_us, window.to_us
-        inner, _ = self.dense.nodes(begin, end)
-        # a tip that is held rings through the whole stretch
-        inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]
-        tip = self.dense.at(np.union1d(np.linspace(begin, end, _POINTS), inner))._asdict()
-        tip["phase"] = [ContactPhase(phase).name.lower() for phase in tip["phase"].tolist()]
-        return {"contacts.csv": _contact_columns(simulation), "trajectory.csv": tip}
+@sections.register
+def _(result: MotionTable) -> list[Section]:
+    simulation, seen, verdict, window = result.run.simulation, result.seen, result.run.verdict, result.seen.window
+    begin, final, phase = simulation.start, simulation.final, ContactPhase(int(simulation.phase)).name.lower()
+    times, mean = f"{float(begin.time_us):.6g} to {float(final.time_us):.6g}", ""
+    reading = ["Less than a response period: no means, energies, amplitudes and phases; follow the motion longer."]
+    if window.responses:
+        mean, reading = f"mean height {seen.mean_height_nm:.6g} nm, ", _over_a_response(seen)
+    position, velocity = f"{float(final.position_nm):.6g} nm", f"{float(final.velocity_nm_per_us):.6g} nm/us"
+    read = f"{window.from_us:.6g} to {window.to_us:.6g}"
+    parts = [
+        f"{'Settled' if verdict.settled else 'Not settled'}: {verdict.reason}.",
+        f"Peak amplitude {seen.peak_amplitude_nm:.6g} nm, {mean}from {read} us.",
+        *reading,
+        f"At the end: {position}, {velocity}, {phase}{'; the sample holds the tip' if verdict.stuck else ''}.",
+        result.extrapolated,
+    ]
+    return [Section(f"{counted(int(simulation.count), 'contact')} from {times} us.", parts)]
+
+
+@csv_columns.register
+def _(result: MotionTable) -> CsvColumns:
+    """Return a row a contact, and the tip, dense in contacts: of a short simulation as a whole, else over the window.
+
+    The window is that of the observables.
+    """
+    simulation, window = result.run.simulation, result.seen.window
+    begin, end = float(simulation.start.time_us), float(simulation.final.time_us)
+    if end - begin > _WHOLE_PERIODS * drive_of(result.dense.scene).period_us:
+        begin, end = window.from_us, window.to_us
+    inner, _ = result.dense.nodes(begin, end)
+    # a tip that is held rings through the whole stretch
+    inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]
+    tip = result.dense.at(np.union1d(np.linspace(begin, end, _POINTS), inner))._asdict()
+    tip["phase"] = [ContactPhase(phase).name.lower() for phase in tip["phase"].tolist()]
+    contacts = {
+        name.removeprefix("contacts_").removeprefix("detail_"): column[: int(simulation.count)].tolist()
+        for name, (column, _) in known_columns(simulation).items()
+        if name.startswith("contacts_")
+    }
+    contacts["kind"] = [ContactKind(kind).name.lower() for kind in contacts["kind"]]
+    return {"contacts.csv": contacts, "trajectory.csv": tip}
 
 
 def _frequency(seen: Observables, multiple: int) -> str:
@@ -162,13 +174,3 @@ def _over_a_response(seen: Observables) -> list[str]:
         f"{seen.dissipated_in_air_aj:.5g} lost in air, {seen.dissipated_in_contact_aj:.5g} in the sample."
     )
     return lines
-
-
-def _contact_columns(simulation: Simulation) -> dict[str, list[Any]]:
-    """Return the columns of all contacts; times of what did not happen are NaN."""
-    columns = {
-        name.removeprefix("contacts_").removeprefix("detail_"): column[: int(simulation.count)].tolist()
-        for name, (column, _) in known_columns(simulation).items()
-        if name.startswith("contacts_")
-    }
-    return columns | {"kind": [ContactKind(kind).name.lower() for kind in columns["kind"]]}

@@ -16,6 +16,7 @@ from afm_jax.dynamics.bifurcations import BifurcationDiagram, Ramps
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
+from afm_jax.dynamics.orbit_tables import OrbitTable
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.plots.picture_style import (
@@ -62,12 +63,13 @@ def label_of(path: str) -> str:
     return f"{words} ({unit})" if unit else words
 
 
-def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits) -> Figure:
+def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits | OrbitTable) -> Figure:
     """Return the picture of orbits, of one scene or of many: where they hit, in their order, and how high they go."""
+    orbits = orbits.orbits if isinstance(orbits, OrbitTable) else orbits
     reading = orbits.reading if isinstance(orbits, ManyImpactOrbits) else orbits
     peak = np.asarray(reading.peak_amplitude_nm, float).ravel()
     phase, velocity, approach = (
-        np.asarray(getattr(reading, name), float).reshape(peak.size, -1)
+        np.asarray(getattr(reading, name), float).reshape(peak.size, -1 if peak.size else 1)
         for name in ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us")
     )
     admissible, stable = np.asarray(reading.admissible).ravel(), np.asarray(orbits.stable).ravel()

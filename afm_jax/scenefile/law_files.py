@@ -23,7 +23,7 @@ import numpy as np
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
-from afm_jax.saved import FIT_FORMAT, why_no_fit
+from afm_jax.saved import FIT_FORMAT, as_json, why_no_fit
 from afm_jax.scenefile.tables import SceneError, read_text
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import write_whole
@@ -79,12 +79,12 @@ def save_law(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: if the file cannot be written.
     """
-    write_whole(path, strict_json({"format": FORMAT, "format_version": FORMAT_VERSION, **law.to_dict()}) + "\n")
+    write_whole(path, strict_json({"format": FORMAT, "format_version": FORMAT_VERSION, **as_json(law)}) + "\n")
 
 
 def save_law_csv(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
     """Write a law's table to a CSV that `load_law` reads: its columns with their units, mass, range and origin."""
-    told = law.to_dict()
+    told = as_json(law)
     low, high = told["speed_range_nm_per_us"]
     comments = [f"# speeds: {low:.6g} to {high:.6g} nm/us"]
     comments += [f"# {key} = {told[key]}" for key in ("mass_ng", "origin", "capture_speed_nm_per_us") if key in told]

@@ -62,6 +62,7 @@ from afm_jax.apparatus.surface import check_steady_response, drive_per_free_heig
 from afm_jax.checks import check_parameter, checked, is_traced
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
+from afm_jax.saved import as_json
 from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.presets import PRESETS, STARTS
 from afm_jax.scenefile.tables import (
@@ -340,7 +341,7 @@ def _interaction_table(interaction: Any) -> dict[str, Any]:
     if isinstance(interaction, TabulatedLaw):
         # a batch is refused
         _number_of(interaction.capture, "interaction")
-        return {"model": "law", "table": interaction.to_dict()}
+        return {"model": "law", "table": as_json(interaction)}
     if isinstance(interaction, ImpactLaw):
         table: dict[str, Any] = {"model": "law", **_numbers_of(interaction, "interaction")}
         if interaction.delay is not None:

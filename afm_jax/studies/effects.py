@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from rich.table import Table
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import WHY_REQUIRED
@@ -33,7 +32,9 @@ from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import DensePath
-from afm_jax.results import Result
+from afm_jax.report import Cell, Section, sections, table_of
+from afm_jax.results import Result, public_result
+from afm_jax.saved import as_json
 from afm_jax.studies.timing import seconds_a_call
 from afm_jax.words import counted, known
 
@@ -183,8 +184,9 @@ class Reduction(NamedTuple):
     cost: float | None
 
 
+@public_result(picture="afm_jax.plots.effects:effects_figure")
 @dataclass(frozen=True)
-class EffectStudy:
+class EffectStudy(Result):
     """All effects of a scene, and which of them an accuracy of the amplitudes does not need.
 
     Attributes:
@@ -201,75 +203,76 @@ class EffectStudy:
     accuracy: float
     reduction: Reduction
 
-    text, plot = Result.text, Result.plot
-    _picture = "afm_jax.plots.effects:effects_figure"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax effects`."""
-        reading, orbit, reduction = self.observed.reading, self.observed.orbit, self.reduction
-        assert reading is not None  # a study has one  # noqa: S101
-        return {
-            "compared": "last fifth of the duration" if orbit is None else "steady orbits",
-            "full": {
-                **reading._asdict(),
-                "drive_periods": None if orbit is None else orbit.periods,
-                "time_us_per_period": self.cost,
-            },
-            "effects": [
-                {
-                    "name": report.effect.name,
-                    "required": report.effect.required is not None,
-                    "change": report.change._asdict(),
-                    "reason": report.reason,
-                    "time_us_per_period": report.cost,
-                    "needed": report.effect.name not in reduction.left_out,
-                }
-                for report in self.effects
-            ],
-            "accuracy": self.accuracy,
-            "not_needed": list(reduction.left_out),
-            "joint_change": reduction.change._asdict(),
-            "reduced": {"time_us_per_period": reduction.cost},
-        }
+@as_json.register
+def _(study: EffectStudy) -> dict[str, Any]:
+    reading, orbit, reduction = study.observed.reading, study.observed.orbit, study.reduction
+    assert reading is not None  # a study has one  # noqa: S101
+    return {
+        "compared": "last fifth of the duration" if orbit is None else "steady orbits",
+        "full": {
+            **reading._asdict(),
+            "drive_periods": None if orbit is None else orbit.periods,
+            "time_us_per_period": study.cost,
+        },
+        "effects": [
+            {
+                "name": report.effect.name,
+                "required": report.effect.required is not None,
+                "change": report.change._asdict(),
+                "reason": report.reason,
+                "time_us_per_period": report.cost,
+                "needed": report.effect.name not in reduction.left_out,
+            }
+            for report in study.effects
+        ],
+        "accuracy": study.accuracy,
+        "not_needed": list(reduction.left_out),
+        "joint_change": reduction.change._asdict(),
+        "reduced": {"time_us_per_period": reduction.cost},
+    }
 
-    def printed(self) -> list[str | Table]:
-        """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
-        payload, reduction = self.to_dict(), self.reduction
-        full, joint = payload["full"], payload["joint_change"]
-        cells: dict[str, Cell] = {
-            "effect": "name",
-            "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
-            "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
-            "phase\ndeg": lambda effect: known(effect["change"]["lockin_phase_deg"]),
-            "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
-            "time\nus/period": "time_us_per_period:.4g",
-            "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
-        }
-        periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
-        summary = (
-            f"Full scene: {counted(full['impacts'], 'impact')} in "
-            f"{window if periods is None else counted(periods, 'drive period')}; "
-            f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
-            f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
-            f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(self.cost, '.4g')} us to compute "
-            "a drive period."
+
+@sections.register
+def _(study: EffectStudy) -> list[Section]:
+    payload, reduction = as_json(study), study.reduction
+    full, joint = payload["full"], payload["joint_change"]
+    cells: dict[str, Cell] = {
+        "effect": "name",
+        "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
+        "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
+        "phase\ndeg": lambda effect: effect["change"]["lockin_phase_deg"],
+        "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
+        "time\nus/period": "time_us_per_period:.4g",
+        "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
+    }
+    periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
+    summary = (
+        f"Full scene: {counted(full['impacts'], 'impact')} in "
+        f"{window if periods is None else counted(periods, 'drive period')}; "
+        f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
+        f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
+        f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(study.cost, '.4g')} us to compute "
+        "a drive period."
+    )
+    reasons = [f"{report.effect.name}: {report.reason}." for report in study.effects if report.reason is not None]
+    conclusion = "every effect that can be left out is needed."
+    if reduction.left_out:
+        conclusion = (
+            f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
+            f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
+            f"{known(reduction.cost, '.4g')} us per drive period."
         )
-        reasons = [f"{report.effect.name}: {report.reason}." for report in self.effects if report.reason is not None]
-        conclusion = "every effect that can be left out is needed."
-        if reduction.left_out:
-            conclusion = (
-                f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
-                f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
-                f"{known(reduction.cost, '.4g')} us per drive period."
-            )
-        table = printed_table("Without the effect", cells, payload["effects"])
-        return [summary, table, *reasons, f"For amplitudes to {100.0 * self.accuracy:g} % {conclusion}"]
+    table = table_of(cells, payload["effects"], form=".3g")
+    end = f"For amplitudes to {100.0 * study.accuracy:g} % {conclusion}"
+    return [Section("", [summary, "Without the effect:", table, *reasons, end])]
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of effects.csv, a row an effect."""
-        rows = self.to_dict()["effects"]
-        changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
-        return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
+
+@csv_columns.register
+def _(study: EffectStudy) -> CsvColumns:
+    rows = as_json(study)["effects"]
+    changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
+    return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
 
 
 def _percent(share: float | None) -> str:

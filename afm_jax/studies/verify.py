@@ -16,19 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rich.table import Table
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import check_count, require_float64
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, squared_rebound_speed
 from afm_jax.impact.map import next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.outcomes import Outcome
-from afm_jax.results import Result
+from afm_jax.report import Cell, Section, sections, table_of
+from afm_jax.results import Result, public_result
+from afm_jax.saved import as_json
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 TOLERANCE = 1e-10
@@ -60,7 +61,8 @@ class States(NamedTuple):
     order: Any
 
 
-class Check(NamedTuple):
+@dataclass(frozen=True)
+class Check:
     """One line of the verification."""
 
     equation: str
@@ -71,15 +73,14 @@ class Check(NamedTuple):
     passed: bool
 
 
+@public_result()
 @dataclass(frozen=True)
-class Verification:
+class Verification(Result):
     """All comparisons, and the states they were made at."""
 
     checks: list[Check]
     states: int
     seed: int
-
-    text = Result.text
 
     @property
     def reason(self) -> str | None:
@@ -89,26 +90,27 @@ class Verification:
         ]
         return f"equations differ by more than {TOLERANCE:g}: {', '.join(failed)}" if failed else None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax verify`."""
-        checks = [check._asdict() for check in self.checks]
-        passed = self.reason is None
-        return {"checks": checks, "passed": passed, "tolerance": TOLERANCE, "seed": self.seed, "states": self.states}
 
-    def printed(self) -> list[str | Table]:
-        """Return the comparisons as a table, and what is allowed."""
-        cells: dict[str, Cell] = {
-            "equation": "equation",
-            "points": "points:d",
-            "worst rel. difference": "max_relative_difference:.1e",
-            "passed": lambda check: "yes" if check.passed else "NO",
-        }
-        allowed = f"Allowed: {TOLERANCE:g} from automatic differentiation, the worse of forward and reverse."
-        return [printed_table("", cells, self.checks), allowed]
+@as_json.register
+def _(result: Verification) -> dict[str, Any]:
+    return vars(result) | {"passed": result.reason is None, "tolerance": TOLERANCE}
 
-    def tables(self) -> dict[str, dict[str, list[Any]]]:
-        """Return the columns of verify.csv, a row a comparison."""
-        return {"verify.csv": columns_of([check._asdict() for check in self.checks])}
+
+@sections.register
+def _(result: Verification) -> list[Section]:
+    cells: dict[str, Cell] = {
+        "equation": "equation",
+        "points": "points:d",
+        "worst rel. difference": "max_relative_difference:.1e",
+        "passed": lambda check: "yes" if check.passed else "NO",
+    }
+    allowed = f"Allowed: {TOLERANCE:g} from automatic differentiation, the worse of forward and reverse."
+    return [Section("", [table_of(cells, result.checks), allowed])]
+
+
+@csv_columns.register
+def _(result: Verification) -> CsvColumns:
+    return {"verify.csv": columns_of([vars(check) for check in result.checks])}
 
 
 def verify(*, states: int = 10_000, seed: int = 0) -> Verification:

@@ -11,12 +11,14 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
 from afm_jax.checks import check_parameter, checked
-from afm_jax.columns import printed_table
+from afm_jax.columns import CsvColumns, csv_columns
+from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import bullets, counted, decimals, with_error
+from afm_jax.words import counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import Resonance, read_resonance
@@ -96,39 +98,42 @@ class Calibration(JudgedResult):
             *(f"# spring_constant_n_per_m = {one.in_words}" for one in sure[:1]),
         ]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax calibrate`."""
-        own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
-        more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
-        return plain({"format": "afm-jax calibrate", "format_version": 2} | own | more)
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of calibration_points.csv: the scan and the fit."""
-        sweep = self.sweep
-        columns = {"frequency_khz": sweep.frequency_khz, "measured_amplitude": sweep.amplitude}
-        columns["fitted_amplitude"] = np.abs(self.fitted)
-        if sweep.phase_deg is not None:
-            # the turns of the measured phase are kept
-            apart = np.angle(self.fitted * np.exp(-1j * np.deg2rad(sweep.phase_deg)), deg=True)
-            columns |= {"measured_phase_deg": sweep.phase_deg, "fitted_phase_deg": sweep.phase_deg + apart}
-        return {"calibration_points.csv": columns}
+@as_json.register
+def _(lever: Calibration) -> dict[str, Any]:
+    own = {name: value for name, value in vars(lever).items() if name not in {"sweep", "fitted"}}
+    more = {"valid": lever.valid, "instrument": lever.sweep.instrument, "table_comments": lever.table_comments}
+    return plain({"format": "afm-jax calibrate", "format_version": 2} | own | more)
 
-    def printed(self) -> list[Any]:
-        """Return verdict, values, and the lines for an amplitude table."""
-        values = {"frequency_khz (kHz)": self.frequency_khz, "quality_factor": self.quality_factor}
-        values |= {f"spring constant, {name} (N/m)": one for name, one in self.spring_constant_n_per_m.items()}
-        cells: dict[str, Any] = {
-            "of the free cantilever": lambda row: row[0],
-            "value +- standard error": lambda row: row[1].in_words,
-        }
-        return [
-            f"{self.verdict}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
-            printed_table("", cells, [*values.items()]),
-            f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}",
-            *bullets("Reasons:", self.reasons),
-            *bullets("Notes:", self.warnings),
-            *(["", "For the top of an amplitude table:", *self.table_comments] if self.valid else []),
-        ]
+
+@csv_columns.register
+def _(lever: Calibration) -> CsvColumns:
+    # the scan and the fit
+    sweep = lever.sweep
+    columns = {"frequency_khz": sweep.frequency_khz, "measured_amplitude": sweep.amplitude}
+    columns["fitted_amplitude"] = np.abs(lever.fitted)
+    if sweep.phase_deg is not None:
+        # the turns of the measured phase are kept
+        apart = np.angle(lever.fitted * np.exp(-1j * np.deg2rad(sweep.phase_deg)), deg=True)
+        columns |= {"measured_phase_deg": sweep.phase_deg, "fitted_phase_deg": sweep.phase_deg + apart}
+    return {"calibration_points.csv": columns}
+
+
+@sections.register
+def _(lever: Calibration) -> list[Section]:
+    values = {"frequency_khz (kHz)": lever.frequency_khz, "quality_factor": lever.quality_factor}
+    values |= {f"spring constant, {name} (N/m)": one for name, one in lever.spring_constant_n_per_m.items()}
+    cells: dict[str, Cell] = {
+        "of the free cantilever": lambda row: row[0],
+        "value +- standard error": lambda row: row[1].in_words,
+    }
+    comments = lever.table_comments
+    chi2 = f"chi2/dof {lever.chi2:.1f}/{lever.degrees_of_freedom}, errors: {lever.error_origin}"
+    return [
+        Section(f"{lever.sweep.source}, {counted(lever.sweep.points, 'point')}", []),
+        Section("Values", [table_of(cells, [*values.items()]), chi2]),
+        Section("Comments", ["\n".join(["For the top of an amplitude table:", *comments]) if comments else None]),
+    ]
 
 
 @checked

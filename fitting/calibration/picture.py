@@ -3,13 +3,14 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from afm_jax.columns import csv_columns
 from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
 from fitting.calibration.calibrate import Calibration
 
 
 def calibration_figure(result: Calibration) -> Figure:
     """Return the figure: amplitude (and phase) with the fit above, what is left below."""
-    (columns,) = result.tables().values()
+    (columns,) = csv_columns(result).values()
     kinds = ["amplitude", *(["phase_deg"] if "measured_phase_deg" in columns else [])]
     figure = new_figure(1.0 + 5.5 * len(kinds), 5.5)
     grid = figure.subplots(2, len(kinds), squeeze=False, sharex=True, height_ratios=(2.0, 1.0))

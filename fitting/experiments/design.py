@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import check_count, check_parameter, checked, in_float64
-from afm_jax.columns import rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.impact.law import extrapolation_of
+from afm_jax.report import Bullets, Section, Table, sections
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import bullets, known, text_table, with_error
+from afm_jax.words import known, with_error
 from fitting.experiments.candidates import (
     LEFT_OUT,
     PHASE_NOISE_DEG,
@@ -37,7 +39,7 @@ _EXACT = "The quality factor is taken as exact, which makes forecasts too good: 
 
 
 _EXPECTED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg", "approach_speed_nm_per_us")
-_PRINTED = {
+_SHOWN = {
     "order": ("N", "d"),
     "drive_frequency_khz": ("kHz", ".8g"),
     "drive_amplitude_nm": ("nm", ".5g"),
@@ -51,7 +53,7 @@ _PRINTED = {
 """Head and format of the columns that are printed."""
 
 
-@public_result(picture="fitting.experiments.picture:design_figure", rows="points")
+@public_result(picture="fitting.experiments.picture:design_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Design(JudgedResult):
     """The drives to measure next and the errors to expect: what `design` returns, named like the keys of its JSON.
@@ -122,51 +124,49 @@ class Design(JudgedResult):
         }
         return dict(zip(self.prior.problem.names, plain(rows_of(columns)), strict=True))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax design`; what is not known is None."""
-        names = ("valid", "reasons", "warnings", "noise", "interest", "expected", "measured_so_far")
-        return {
-            "format": "afm-jax design",
-            "format_version": 2,
-            "drive": self.prior.problem.drive,
-            "model": self.prior.problem.model,
-            **{name: getattr(self, name) for name in names},
-            "points": self.points(),
-            "candidates": int(self.candidates.usable.sum()),
-            "left_out": self.candidates.left_out,
-            "prior": {"source": self.prior.source, "rows_measured": len(self.prior.measured)},
-        }
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of design.csv: the drive, then what is expected."""
-        return {"design.csv": self.columns}
+@as_json.register
+def _(plan: Design) -> dict[str, Any]:
+    names = ("valid", "reasons", "warnings", "noise", "interest", "expected", "measured_so_far")
+    return {
+        "format": "afm-jax design",
+        "format_version": 2,
+        "drive": plan.prior.problem.drive,
+        "model": plan.prior.problem.model,
+        **{name: getattr(plan, name) for name in names},
+        "points": plan.points(),
+        "candidates": int(plan.candidates.usable.sum()),
+        "left_out": plan.candidates.left_out,
+        "prior": {"source": plan.prior.source, "rows_measured": len(plan.prior.measured)},
+    }
 
-    def printed(self) -> list[Any]:
-        """Return the verdict, the points, what they will determine, and notes."""
-        columns, points, problem = self.columns, self.points(), self.prior.problem
-        printed = {name: style for name, style in _PRINTED.items() if name in columns}
-        table = {head: [f"{value:{form}}" for value in columns[name]] for name, (head, form) in printed.items()}
-        for name in self.interest[:4]:
-            table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
-        after = [
-            f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
-            for name, entry in self.expected.items()
-        ]
-        usable, left_out = self.candidates.usable, self.candidates.left_out
-        title = f"{self.verdict}: {len(self.chosen)} points to measure next for {', '.join(self.interest)}"
-        return [
-            f"{title} ({problem.model}, {self.prior.source})",
-            *bullets("Reasons:", self.reasons),
-            "",
-            *text_table([*table], zip(*table.values(), strict=True), words=()),
-            "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
-            f"After all: {', '.join(after)}",
-            *bullets(
-                f"{usable.sum()} of {usable.size} drives can be planned with.",
-                [f"{count} left out: {LEFT_OUT[name]}" for name, count in left_out.items()],
-            ),
-            *bullets("Notes:", self.warnings),
-        ]
+
+@csv_columns.register
+def _(plan: Design) -> CsvColumns:
+    return {"design.csv": plan.columns}
+
+
+@sections.register
+def _(plan: Design) -> list[Section]:
+    columns, points, problem = plan.columns, plan.points(), plan.prior.problem
+    shown = {name: style for name, style in _SHOWN.items() if name in columns}
+    table = {head: [f"{value:{form}}" for value in columns[name]] for name, (head, form) in shown.items()}
+    for name in plan.interest[:4]:
+        table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
+    after = [
+        f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
+        for name, entry in plan.expected.items()
+    ]
+    usable, left_out = plan.candidates.usable, plan.candidates.left_out
+    title = f"{len(plan.chosen)} points to measure next for {', '.join(plan.interest)}"
+    said = "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured"
+    why = [f"{count} left out: {LEFT_OUT[name]}" for name, count in left_out.items()]
+    return [
+        Section(f"{title} ({problem.model}, {plan.prior.source})", []),
+        Section("Points", [Table("", [*table], [*zip(*table.values(), strict=True)]), said]),
+        Section("Forecast", [f"After all: {', '.join(after)}"]),
+        Section("Drives", [Bullets(why, f"{usable.sum()} of {usable.size} drives can be planned with.")]),
+    ]
 
 
 @checked

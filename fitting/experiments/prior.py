@@ -16,7 +16,7 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
-from afm_jax.saved import why_no_fit
+from afm_jax.saved import as_json, why_no_fit
 from afm_jax.words import printable
 from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
@@ -195,7 +195,7 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         TableError: if a value or the correlations are impossible.
         ValueError: if the model or a parameter is none.
     """
-    payload = result.to_dict() if isinstance(result, FitResult) else result
+    payload = as_json(result) if isinstance(result, FitResult) else result
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"

@@ -12,6 +12,7 @@ import numpy as np
 
 from afm_jax.checks import checked, in_float64
 from afm_jax.results import Result, public_result
+from afm_jax.saved import as_json
 from fitting.infer.fit import fit, tables_of
 from fitting.infer.law import closest_loss, rebound_by_formula
 from fitting.infer.result import FitResult
@@ -23,7 +24,7 @@ _EVEN, _PLAIN = 2.0, 10.0
 """Differences of AIC up to which models are even, and beyond which one is clearly favoured."""
 
 
-@public_result(picture="fitting.report.plots:models_figure", rows="rows")
+@public_result(picture="fitting.report.plots:models_figure", home="fitting.report.report")
 @dataclass(frozen=True)
 class Comparison(Result):
     """Models of one table, the best one first.
@@ -41,9 +42,10 @@ class Comparison(Result):
     verdict: str
     results: dict[str, FitResult]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return rows and verdict, without the fits."""
-        return {"rows": self.rows, "verdict": self.verdict}
+
+@as_json.register
+def _(result: Comparison) -> dict[str, Any]:
+    return {"rows": result.rows, "verdict": result.verdict}
 
 
 def rivals(model: str, fixed: Mapping[str, float] | None = None) -> tuple[str, ...]:

@@ -4,8 +4,9 @@ Energies and delta with their intervals (`Loss`), beside the parameters, are the
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.checks import in_float64
 from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
-from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
+from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION, as_json
+from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.strict_json import plain
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from fitting.infer.law import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
@@ -259,12 +262,14 @@ class FittedLaw(TabulatedLaw):
         self.delay_low_us = self.collision_delay_us - width[1]
         self.delay_high_us = self.collision_delay_us + width[1]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
-        return super().to_dict() | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
+
+@as_json.register
+def _(law: FittedLaw) -> dict[str, Any]:
+    # its points with units in their names, and all that makes it again
+    return as_json.dispatch(TabulatedLaw)(law) | {name: plain(getattr(law, name)) for name in FittedLaw.__annotations__}
 
 
-@public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
+@public_result(picture="fitting.report.plots:rows_figure", home="fitting.report.report")
 @dataclass(frozen=True)
 class FitResult(Result):
     """The outcome of `fit`; attributes are named like the keys of its JSON.
@@ -313,20 +318,28 @@ class FitResult(Result):
     loss: Loss | None = None
     tables: tuple[FittedTable, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain lists, numbers and strings; what is not known is None."""
-        left_out = {"table"} if self.tables else {"table", "tables"}
-        names = [field.name for field in dataclasses.fields(self) if field.name not in left_out]
-        return plain(
-            {"format": FIT_FORMAT, "format_version": FIT_FORMAT_VERSION}
-            | {name: getattr(self, name) for name in names}
-            | {
-                "correlations": {"names": list(self.parameters), "matrix": self.correlations},
-                "law": self.law.to_dict(),
-                "input": self.table,
-                "repeats": repeats_of(self.table),
-            }
-        )
+    def report(self, folder: str | Path, name: str = "", more: Sequence[Any] = ()) -> list[Path]:
+        """Write this fit into a folder as every result, and its law as law.csv; return the paths."""
+        paths, law = super().report(folder, name, more), Path(folder) / "law.csv"
+        save_law_csv(self.law, law)
+        return [*paths, law]
+
+
+@as_json.register
+@in_float64
+def _(fit: FitResult) -> dict[str, Any]:
+    left_out = {"table"} if fit.tables else {"table", "tables"}
+    names = [field.name for field in dataclasses.fields(fit) if field.name not in left_out]
+    return plain(
+        {"format": FIT_FORMAT, "format_version": FIT_FORMAT_VERSION}
+        | {name: getattr(fit, name) for name in names}
+        | {
+            "correlations": {"names": list(fit.parameters), "matrix": fit.correlations},
+            "law": as_json(fit.law),
+            "input": fit.table,
+            "repeats": repeats_of(fit.table),
+        }
+    )
 
 
 @jax.jit

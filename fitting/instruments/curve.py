@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.results import JudgedResult, public_result
-from afm_jax.strict_json import plain
 from fitting.instruments.bins import binned, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import (
@@ -55,7 +54,7 @@ _WANTED = ("quality_factor", "spring_constant_n_per_m")
 """What a table cannot do without, and what it asks for."""
 
 
-@public_result()
+@public_result(home="fitting.instruments.report")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredCurve(JudgedResult):
     """One curve of a file, approach and retract together; the arrays have the shape (rows,).
@@ -104,10 +103,6 @@ class MeasuredCurve(JudgedResult):
         """Return a known number, None where it is not known."""
         found = self.known.get(key)
         return None if found is None or isinstance(found.value, str) else found.value
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain lists, numbers and strings; what is not known is None."""
-        return plain(vars(self) | {"valid": self.valid})
 
 
 @checked

@@ -5,39 +5,61 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.report import Bullets, Section, Table, sections
+from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
+from afm_jax.strict_json import plain
 from afm_jax.whole_files import write_whole
-from afm_jax.words import bullets, text_table
 from fitting.instruments.curve import FORMAT_VERSION, MeasuredCurve, table_text
 
 
-def curves_payload(curves: list[MeasuredCurve]) -> dict[str, Any]:
-    """Return everything that was read as plain lists, numbers and strings."""
-    own = {"source": curves[0].source, "instrument_format": curves[0].format}
-    listed = [curve.to_dict() for curve in curves]
-    return {"format": "afm-jax read", "format_version": FORMAT_VERSION, **own, "curves": listed}
+@public_result()
+class CurvesOfFile(ResultTuple):
+    """What `afm-jax read` tells: the curves of one file."""
+
+    curves: list[MeasuredCurve]
+
+    @property
+    def reason(self) -> str | None:
+        """Which curves must not be used; None where all may."""
+        refused = [curve for curve in self.curves if not curve.valid]
+        numbers = ", ".join(str(curve.curve) for curve in refused)
+        return f"{refused[0].source}: refused curve {numbers}; {refused[0].reasons[0]}" if refused else None
 
 
-def curves_summary(curves: list[MeasuredCurve]) -> str:
-    """Return what was read as text: the curves, what is known and from where, what is missing, what was assumed."""
+@as_json.register
+def _(read: CurvesOfFile) -> dict[str, Any]:
+    first, curves = read.curves[0], [plain(as_json(curve)) for curve in read.curves]
+    own = {"source": first.source, "instrument_format": first.format}
+    return {"format": "afm-jax read", "format_version": FORMAT_VERSION, **own, "curves": curves}
+
+
+@sections.register
+def _(result: MeasuredCurve) -> list[Section]:
+    return sections(CurvesOfFile([result]))
+
+
+@sections.register
+def _(read: CurvesOfFile) -> list[Section]:
+    # the curves, what is known and from where, what is missing, what was assumed
+    curves = read.curves
     first = curves[0]
     known = {key: one for key, one in first.known.items() if key not in _OWN}
     values = [one.value if isinstance(one.value, str) else f"{one.value:.7g}" for one in known.values()]
     rows = [[key, value, one.unit, one.origin] for (key, one), value in zip(known.items(), values, strict=True)]
     heads = ["curve", "rows", "heights (nm)", "free amplitude", "in contact", ""]
-    lines = [
-        f"{first.source} ({first.format}):",
-        "",
-        *text_table(heads, map(_row, curves), words=(5,)),
-        "",
-        *text_table(["known", "value", "unit", "from"], rows, words=(0, 2, 3)),
-    ]
     asked = [f"{key}: `{key}=...`" for key in dict.fromkeys(k for c in curves if c.valid for k in c.missing)]
-    lines += bullets("The file does not say:", asked)
     common = set.intersection(*(set(curve.notes) for curve in curves))
     notes = ((note if note in common else f"curve {each.curve}: {note}") for each in curves for note in each.notes)
-    lines += bullets("Notes:", list(dict.fromkeys(notes)))
-    lines += bullets("Refused:", [f"curve {curve.curve}: {reason}" for curve in curves for reason in curve.reasons])
-    return "\n".join(lines)
+    refused = [f"curve {curve.curve}: {reason}" for curve in curves for reason in curve.reasons]
+    return [
+        Section(f"{first.source} ({first.format}):", []),
+        Section("Curves", [Table("", heads, [*map(_row, curves)])]),
+        Section("Known", [Table("", ["known", "value", "unit", "from"], rows)]),
+        Section("Missing", [Bullets(asked, "The file does not say:")]),
+        Section("Notes", [Bullets(list(dict.fromkeys(notes)), "Notes:")]),
+        Section("Refused", [Bullets(refused, "Refused:")]),
+    ]
 
 
 _OWN = ("free_amplitude_nm", "offset_origin_nm", "phase_zero_deg", "amplitude_error_nm", "phase_error_deg")

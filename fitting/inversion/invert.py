@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked, in_float64
-from afm_jax.columns import printed_table, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
+from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.words import bullets, with_error
+from afm_jax.words import with_error
 from fitting.infer.unknowns import NEUTRAL, UNDAMPED
 from fitting.inversion.flight import invert_rows
 from fitting.models import constraints_of, readings_of
@@ -55,7 +57,7 @@ class Line:
     p_value: float
 
 
-@public_result(picture="fitting.inversion.picture:inversion_figure", rows="records")
+@public_result(picture="fitting.inversion.picture:inversion_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Inversion(JudgedResult):
     """What `invert` finds; rows that give nothing are NaN and have a note.
@@ -98,43 +100,44 @@ class Inversion(JudgedResult):
         """The law of the line with the smaller chi2; None without lines."""
         return min(self.lines, key=lambda name: self.lines[name].chi2, default=None)
 
-    def records(self) -> list[dict[str, Any]]:
-        """Return the rows, each with its drive."""
-        return rows_of(self.tables()["invert.csv"])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax invert`."""
-        names = ("valid", "reasons", "warnings", "preferred", "shared_names")
-        own = {"format": "afm-jax invert", "format_version": 2} | {name: getattr(self, name) for name in names}
-        return own | {"rows": self.records(), "lines": {name: vars(line) for name, line in self.lines.items()}}
+@as_json.register
+def _(result: Inversion) -> dict[str, Any]:
+    names = ("valid", "reasons", "warnings", "preferred", "shared_names")
+    own = {"format": "afm-jax invert", "format_version": 2} | {name: getattr(result, name) for name in names}
+    rows = rows_of(csv_columns(result)["invert.csv"])
+    return own | {"rows": rows, "lines": {name: vars(line) for name, line in result.lines.items()}}
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of invert.csv."""
-        drive = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
-        columns: dict[str, Any] = {name: getattr(self.table, name) for name in drive}
-        found = {"approach_speed": "nm_per_us", "rebound_speed": "nm_per_us", "collision_delay": "us"}
-        for (name, unit), error in zip(found.items(), self.errors.T, strict=True):
-            columns |= {f"{name}_{unit}": getattr(self, f"{name}_{unit}"), f"{name}_error_{unit}": error}
-        return {"invert.csv": columns | {"in_lines": self.in_lines, "note": list(self.note)}}
 
-    def printed(self) -> list[Any]:
-        """Return the verdict, the rows and the lines."""
-        cells: dict[str, Any] = {
-            **{name: name.replace(" ", "_") for name in ("order", "drive frequency khz", "drive amplitude nm")},
-            "approach\nnm/us": "approach_speed_nm_per_us:.4f",
-            "rebound\nnm/us": "rebound_speed_nm_per_us:.4f",
-            "delay\nus": "collision_delay_us:.4f",
-            "note": "note",
-        }
-        lines = [
-            f"u_in^2 - u_out^2 = epsilon + {name} u_in{'^2' * (law != 'viscous')}: epsilon "
-            f"{with_error(line.epsilon, line.epsilon_error)}, {name} {with_error(line.slope, line.slope_error)}, "
-            f"chi2/dof {line.chi2:.1f}/{line.degrees_of_freedom}"
-            for (law, line), name in zip(self.lines.items(), ("viscous_loss", "(1 - r^2)"), strict=False)
-        ]
-        head = f"{self.verdict}: {self.table.source}, {self.table.rows} rows"
-        notes = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
-        return [head, printed_table("", cells, self.records()), *lines, *notes]
+@csv_columns.register
+def _(result: Inversion) -> CsvColumns:
+    drive = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    columns: dict[str, Any] = {name: getattr(result.table, name) for name in drive}
+    found = {"approach_speed": "nm_per_us", "rebound_speed": "nm_per_us", "collision_delay": "us"}
+    for (name, unit), error in zip(found.items(), result.errors.T, strict=True):
+        columns |= {f"{name}_{unit}": getattr(result, f"{name}_{unit}"), f"{name}_error_{unit}": error}
+    return {"invert.csv": columns | {"in_lines": result.in_lines, "note": list(result.note)}}
+
+
+@sections.register
+def _(result: Inversion) -> list[Section]:
+    cells: dict[str, Cell] = {
+        **{name: name.replace(" ", "_") for name in ("order", "drive frequency khz", "drive amplitude nm")},
+        "approach\nnm/us": "approach_speed_nm_per_us:.4f",
+        "rebound\nnm/us": "rebound_speed_nm_per_us:.4f",
+        "delay\nus": "collision_delay_us:.4f",
+        "note": "note",
+    }
+    lines = [
+        f"u_in^2 - u_out^2 = epsilon + {name} u_in{'^2' * (law != 'viscous')}: epsilon "
+        f"{with_error(line.epsilon, line.epsilon_error)}, {name} {with_error(line.slope, line.slope_error)}, "
+        f"chi2/dof {line.chi2:.1f}/{line.degrees_of_freedom}"
+        for (law, line), name in zip(result.lines.items(), ("viscous_loss", "(1 - r^2)"), strict=False)
+    ]
+    return [
+        Section(f"{result.table.source}, {result.table.rows} rows", []),
+        Section("Impacts", [table_of(cells, rows_of(csv_columns(result)["invert.csv"])), *lines]),
+    ]
 
 
 @checked

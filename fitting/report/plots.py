@@ -8,7 +8,6 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
 from fitting.infer.comparison import Comparison
 from fitting.infer.result import FitResult
 from fitting.report.words import has_delay
@@ -17,20 +16,13 @@ from fitting.report.words import has_delay
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
 ALARM = "#B00020"
 SMALL = 9
-_WIDTH_INCHES, DPI = 6.4, 190.0
+_WIDTH_INCHES = 6.4
 """Narrow enough that letters can still be read on a screen of 420 pixels."""
 _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
 _ROW_AXIS = "rows, by order N, drive frequency, amplitude and offset"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _APPROACH = "approach speed (nm/µs)"
-
-
-def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return fit.png, and its parts as SVG: the rows, the law, and the residuals over the speed."""
-    figures = [rows_figure(result), law_figure(result), speed_figure(result)]
-    parts = [pixels_of(figure, DPI) for figure in figures]
-    return [png_of_pixels(np.concatenate(parts), DPI), *map(svg_of, figures)]
 
 
 def rows_figure(result: FitResult) -> Figure:

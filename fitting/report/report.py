@@ -1,30 +1,14 @@
-"""A fit as a person reads it: text for the terminal, files for the drawer (HTML, JSON, CSV, PNG)."""
+"""A fit as a person reads it: sections of the fit, of a comparison of models, and of a posterior."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from afm_jax.columns import rows_of
-from afm_jax.saved import saved
-from afm_jax.scenefile.law_files import save_law_csv
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
+from afm_jax.report import Bullets, Picture, Section, Table, in_words, sections
 from afm_jax.words import counted, known, percent
 from fitting.infer.comparison import Comparison
 from fitting.infer.result import FitResult, FittedParameter
-from fitting.report.files import write_report_files
-from fitting.report.sections import (
-    Bullets,
-    Report,
-    ReportSection,
-    Table,
-    Text,
-    page_of,
-    pairs,
-    pictures_of,
-    text_of,
-)
 from fitting.report.words import (
     PULLS,
     band_in_words,
@@ -40,36 +24,45 @@ from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
 
 
-def summary(result: FitResult, comparison: Comparison | None = None, posterior: Posterior | None = None) -> str:
-    """Return the fit as text: verdict first, then the law, then goodness of fit and warnings."""
-    return text_of(fit_report(result, comparison, posterior))
-
-
-def fit_report(result: FitResult, comparison: Comparison | None = None, posterior: Posterior | None = None) -> Report:
-    """Return the sections of a fit, with those of other models of its table and of its posterior, if there are any."""
-    head = ["parameter", "value", "std. error", "95 % interval"]
-    cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
-    parting = parting_in_words(result) if result.valid else ""
-    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
-    chi2 = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
+@sections.register
+def _(fit: FitResult) -> list[Section]:
+    cells = [_parameter_cells(name, parameter) for name, parameter in fit.parameters.items()]
+    parting = parting_in_words(fit) if fit.valid else ""
+    probability = f", probability {fit.p_value:.2g}" if np.isfinite(fit.p_value) else ""
+    chi2 = f"chi2/dof = {fit.chi2:.1f}/{fit.degrees_of_freedom}{probability}"
     # where impacts last chi2 makes up for what a formula lacks
-    chi2 += "" if has_delay(result) else f", AIC {result.aic:.1f}"
-    goodness = [f"  {line}" for line in (band_in_words(result), parting, chi2) if line]
-    return Report(
-        title=f"Impact law of {result.table.source} ({counted(result.table.rows, 'row')}), model {result.model}:",
-        about=[line for line in (*formulas(result), held_in_words(result)) if line],
-        valid=result.valid,
-        doubt="" if result.valid else "the numbers below are not a measurement of the law.",
-        reasons=result.reasons,
-        sections=[
-            ReportSection("Parameters", [Table("Fitted parameters", head, cells, words=head[-1:])]),
-            ReportSection("Goodness of fit", [Text("\n".join(goodness), "lines")]),
-            *_table_sections(result),
-            ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
-            *([] if comparison is None else [_compared(comparison)]),
-            *([] if posterior is None else [_sampled(posterior)]),
-        ],
-    )
+    chi2 += "" if has_delay(fit) else f", AIC {fit.aic:.1f}"
+    title = f"Impact law of {fit.table.source} ({counted(fit.table.rows, 'row')}), model {fit.model}:"
+    return [
+        Section(title, [f"  {line}" for line in (*formulas(fit), held_in_words(fit)) if line]),
+        Section("Pictures", [Picture(f"fitting.report.plots:{name}", words) for name, words in _PICTURES.items()]),
+        Section("Parameters", [Table("Fitted parameters", _PARAMETER_HEAD, cells)]),
+        Section("Goodness of fit", [f"  {line}" for line in (band_in_words(fit), parting, chi2) if line]),
+        *_table_sections(fit),
+        Section("Inputs", _inputs(fit), page_only=True),
+    ]
+
+
+_PARAMETER_HEAD = ("parameter", "value", "std. error", "95 % interval")
+_PICTURES = {
+    "rows_figure": (
+        "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors."
+    ),
+    "law_figure": "The law over the approach speed, with its 95 % band.",
+    "speed_figure": (
+        "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here."
+    ),
+}
+
+
+def _inputs(fit: FitResult) -> list[Any]:
+    """Return the remarks of the tables, the options of the fit, and what computed it."""
+    parts: list[Any] = [Bullets([remark for table in fit.table.tables for remark in table.remarks])]
+    named = (("Options of the fit", "option", fit.settings), ("What computed it", "package", fit.versions))
+    for caption, name, values in named:
+        rows = [[key, value if isinstance(value, str) else in_words(value)] for key, value in values.items()]
+        parts.append(Table(caption, [name, "value"], rows))
+    return parts
 
 
 def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
@@ -78,26 +71,26 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
     return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
 
 
-def _table_sections(result: FitResult) -> list[ReportSection]:
+def _table_sections(fit: FitResult) -> list[Section]:
     """Return each of several tables' pull, what it has to itself, and the energy lost in an impact."""
     pulls, own = [], []
-    for one in result.tables:
+    for one in fit.tables:
         pulls.append([one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")])
         own += [[one.name, *_parameter_cells(name, parameter)] for name, parameter in one.nuisances.items()]
-    table = Table("Tables", ["table", "rows used", "chi2/readings", "pull"], pulls)
     head = ["table", "its nuisance", "value", "std. error", "95 % interval"]
-    loss = ["loss of an impact", "95 % interval"]
-    losses = losses_in_words(result) if result.valid else []
+    table = Table("Tables", ["table", "rows used", "chi2/readings", "pull"], pulls)
+    losses = losses_in_words(fit) if fit.valid else []
     return [
-        ReportSection("Tables", [table, Text(PULLS if pulls else "")]),
-        ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]),
-        ReportSection("Losses", [Table("Energy lost in an impact", loss, losses, words=loss)]),
+        Section("Tables", [table, PULLS if pulls else None]),
+        Section("Nuisances", [Table("Of each table", head, own)]),
+        Section("Losses", [Table("Energy lost in an impact", ["loss of an impact", "95 % interval"], losses)]),
     ]
 
 
-def _compared(comparison: Comparison) -> ReportSection:
-    by_distance, rows = "largest_distance" in comparison.rows[0], []
-    for row in comparison.rows:
+@sections.register
+def _(result: Comparison) -> list[Section]:
+    by_distance, rows = "largest_distance" in result.rows[0], []
+    for row in result.rows:
         cells = [f"{row[name]:.1f}" for name in ("aic", "delta_aic")] if not by_distance else []
         if by_distance:
             share = row.get("largest_relative_distance")
@@ -108,26 +101,32 @@ def _compared(comparison: Comparison) -> ReportSection:
     if by_distance:
         said = "Formulas and the law that was found without them, the closest first:"
         head[2:4] = ["at most off (band half-widths)", "of u_out"]
-    return ReportSection("Comparison", [Text(said), Table("Models", head, rows), Text(f"  {comparison.verdict}")])
+    return [Section("Comparison", [said, Table("Models", head, rows), f"  {result.verdict}"])]
 
 
-def _sampled(posterior: Posterior) -> ReportSection:
+@csv_columns.register
+def _(result: Comparison) -> CsvColumns:
+    return {"models.csv": columns_of(result.rows)}
+
+
+@sections.register
+def _(drawn: Posterior) -> list[Section]:
     rows = [
-        [name, f"{posterior.mean[name]:.6g}", *(f"{end:.6g}" for end in ends)]
-        for name, ends in posterior.interval95.items()
+        [name, f"{drawn.mean[name]:.6g}", *(f"{end:.6g}" for end in ends)] for name, ends in drawn.interval95.items()
     ]
     head = ["parameter", "mean", "from", "to"]
     said = "95 % credible intervals (posterior, flat priors):"
-    if posterior.method == "gaussian":
-        worth = f"weighted to chi2, {posterior.chains.effective_samples[0]:.0f} of 120 are effective"
+    if drawn.method == "gaussian":
+        worth = f"weighted to chi2, {drawn.chains.effective_samples[0]:.0f} of 120 are effective"
         said = f"95 % intervals of samples of the Gaussian around the fit ({worth}):"
-    wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
-    return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
+    wrong = [f"Not converged: {reason}" for reason in drawn.reasons]
+    return [Section("Posterior", [said, Table("By parameter", head, rows), Bullets(wrong)])]
 
 
-def row_records(result: FitResult) -> list[dict[str, Any]]:
-    """Return a mapping per row of the table: what was set, measured and predicted, and whether it was used."""
-    table, rows = result.table, result.rows
+@csv_columns.register
+def _(fit: FitResult) -> CsvColumns:
+    """Return what was set, measured and predicted in each row of the table, and whether it was used."""
+    table, rows = fit.table, fit.rows
     columns: dict[str, Any] = {
         "line": table.lines,
         "order": table.order,
@@ -151,62 +150,4 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
         columns["predicted_phase_deg"] = rows.predicted_phase_deg
         columns["phase_residual"] = rows.residual[:, 2]
     of_table = {"table": np.array(table.labels)[table.number]} if isinstance(table, SeveralTables) else {}
-    return rows_of(of_table | columns)
-
-
-def write_report(
-    result: FitResult,
-    folder: Path,
-    write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
-    *,
-    comparison: Comparison | None = None,
-    posterior: Posterior | None = None,
-) -> list[Path]:
-    """Write fit.html, fit.txt, fit.json, fit.png, the law as law.csv and the table fit_rows.csv into a folder.
-
-    Args:
-        result: the fit; `afm_jax.load` of fit.json gives it back.
-        folder: an existing folder; files of these names are replaced.
-        write_table: called with a file name, records and columns for each CSV file.
-        comparison: other models of the same table, for fit.html and fit.txt.
-        posterior: credible intervals, for fit.html and fit.txt.
-
-    Returns:
-        The files written here (the tables are `write_table`'s).
-
-    Raises:
-        OSError: if a file cannot be written.
-    """
-    from fitting.report.plots import fit_pictures  # noqa: PLC0415
-
-    picture, *pictures = fit_pictures(result)
-    report = fit_report(result, comparison, posterior)
-    page = fit_page(result, report, pictures)
-    written = write_report_files(folder, "fit", text=text_of(report), data=saved(result), picture=picture, page=page)
-    records = row_records(result)
-    write_table("fit_rows.csv", records, tuple(records[0]))
-    law = folder / "law.csv"
-    save_law_csv(result.law, law)
-    return [*written, law]
-
-
-def fit_page(result: FitResult, report: Report, pictures: Sequence[bytes]) -> str:
-    """Return the page of a fit: its report with pictures, remarks of the tables, and the fit's options.
-
-    Args:
-        result: the fit.
-        report: its sections.
-        pictures: SVG files of the rows, the law, and the residuals over the speed.
-    """
-    shows = (
-        "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors.",
-        "The law over the approach speed, with its 95 % band.",
-        "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
-    )
-    seen = ReportSection("Pictures", pictures_of(pictures, shows))
-    inputs = [
-        Bullets([remark for table in result.table.tables for remark in table.remarks]),
-        pairs("Options of the fit", ("option", "value"), result.settings),
-        pairs("Versions of what computed it", ("package", "version"), result.versions),
-    ]
-    return page_of(replace(report, sections=[seen, *report.sections, ReportSection("Inputs", inputs)]))
+    return {"fit_rows.csv": of_table | columns}

@@ -22,12 +22,12 @@ def known_in_words(known: WithInterval, unit: str = "") -> str:
     return f"{value:.{digits}f}{tail} ({low:.{digits}f} to {high:.{digits}f})"
 
 
-def losses_in_words(result: FitResult) -> list[list[str]]:
+def losses_in_words(fit: FitResult) -> list[list[str]]:
     """Return the losses of an impact, row by row: the name, and the value with its 95 % interval.
 
     The energy at three speeds, delta of the printed epsilon, and the capture speed.
     """
-    loss = result.loss
+    loss = fit.loss
     if loss is None:
         return []
 
@@ -45,18 +45,18 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
 PULLS = "  Pull: how far a table's law is from that of the others, in standard deviations."
 
 
-def formulas(result: FitResult) -> list[str]:
+def formulas(fit: FitResult) -> list[str]:
     """Return the fitted law in formulas."""
-    model = result.model
+    model = fit.model
     if model == "contact":
         return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
     law, lasting = LAWS[model.removesuffix("+delay")], model.endswith("+delay")
     return [one.formula for one in ([law, DELAY_LAW] if lasting else [law])]
 
 
-def parting_in_words(result: FitResult) -> str:
+def parting_in_words(fit: FitResult) -> str:
     """Return how far the formula and the law part; nothing where they are the same, or where there is no formula."""
-    loss = result.loss
+    loss = fit.loss
     if loss is None or loss.formula_off is None or loss.formula_off_at_nm_per_us is None or loss.formula_off <= _EXACT:
         return ""
     return (
@@ -65,16 +65,16 @@ def parting_in_words(result: FitResult) -> str:
     )
 
 
-def held_in_words(result: FitResult) -> str:
+def held_in_words(fit: FitResult) -> str:
     """Return 'Held fixed: r = 0.998, epsilon = 120 nm^2/us^2'; nothing where nothing was."""
-    fixed = result.settings.get("fixed") or {}
+    fixed = fit.settings.get("fixed") or {}
     held = ", ".join(f"{name} = {value:g} {PARAMETERS[name].unit}".rstrip() for name, value in fixed.items())
     return f"Held fixed: {held}" if held else ""
 
 
-def has_delay(result: FitResult) -> bool:
+def has_delay(fit: FitResult) -> bool:
     """Say whether the model's impacts last."""
-    return bool(np.any(result.law.collision_delay_us != 0.0))
+    return bool(np.any(fit.law.collision_delay_us != 0.0))
 
 
 def interval_in_words(parameter: FittedParameter, unit: str = "") -> str:
@@ -108,7 +108,7 @@ def value_in_words(parameter: FittedParameter) -> str:
     return value_alone(parameter.value, parameter.standard_error)
 
 
-def band_width(result: FitResult) -> tuple[float, float, float, float] | None:
+def band_width(fit: FitResult) -> tuple[float, float, float, float] | None:
     """Return how well the band of a law knows the rebound speed over the speeds of the used rows; None without rows.
 
     The band is known at the law's points; between them it is interpolated, at the slowest and fastest row.
@@ -117,10 +117,10 @@ def band_width(result: FitResult) -> tuple[float, float, float, float] | None:
         Slowest and fastest approach in nm/us; the largest half-width of the 95 % band there, relative to the rebound
         speed, and the approach speed it is found at: NaN if there is no band.
     """
-    reached = result.rows.reached_nm_per_us
+    reached = fit.rows.reached_nm_per_us
     if not reached.size:
         return None
-    slowest, fastest, law = float(reached.min()), float(reached.max()), result.law
+    slowest, fastest, law = float(reached.min()), float(reached.max()), fit.law
     speeds = np.clip(law.approach_speed_nm_per_us, slowest, fastest)
     rebound, high = (
         np.interp(speeds, law.approach_speed_nm_per_us, column)
@@ -135,14 +135,14 @@ def band_width(result: FitResult) -> tuple[float, float, float, float] | None:
     return slowest, fastest, float(share[worst]), float(speeds[known][worst])
 
 
-def band_in_words(result: FitResult) -> str:
+def band_in_words(fit: FitResult) -> str:
     """Return how well the law is known over the measured speeds, or why that cannot be said; a sentence."""
-    width = band_width(result)
+    width = band_width(fit)
     if width is None:
         return "No row reached a steady orbit: the law was measured at no speed."
     slowest, fastest, worst, at = width
     where = f"Over the measured approach speeds, {slowest:.3g} to {fastest:.3g} nm/us,"
     if not np.isfinite(worst):
-        cause = "the parameters' errors are not known" if result.valid else "the fit is not valid"
+        cause = "the parameters' errors are not known" if fit.valid else "the fit is not valid"
         return f"{where} no band can be given: {cause}."
     return f"{where} the rebound speed is known to {percent(worst)} or better (95 % band, widest at {at:.3g} nm/us)."

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.results import Result, public_result
+from afm_jax.saved import as_json
 from afm_jax.strict_json import plain
 
 
@@ -31,7 +32,7 @@ class PosteriorChains:
     seed: int
 
 
-@public_result()
+@public_result(home="fitting.report.report")
 @dataclass(frozen=True, eq=False)
 class Posterior(Result):
     """The posterior of a fit's parameters.
@@ -54,23 +55,6 @@ class Posterior(Result):
     chains: PosteriorChains
     method: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything but the single samples as plain lists, numbers and strings."""
-        chains, kinds = self.chains, ("mean", "standard_deviation", "interval95")
-        diagnostics = {
-            name: dict(zip(self.mean, plain(getattr(chains, name)), strict=True))
-            for name in ("r_hat", "effective_samples")
-        }
-        count, draws, _ = chains.samples.shape
-        sizes = {"chains": count, "draws": draws, "seed": chains.seed, "divergences": chains.divergences}
-        return {
-            "method": self.method,
-            "converged": self.converged,
-            "reasons": self.reasons,
-            "parameters": {name: {kind: getattr(self, kind)[name] for kind in kinds} for name in self.mean},
-            "chains": sizes | diagnostics,
-        }
-
     def to_arviz(self) -> Any:
         """Return the samples as ArviZ's data, for its pictures and summaries.
 
@@ -85,6 +69,25 @@ class Posterior(Result):
         groups: dict[str, Any] = {"posterior": dict(zip(self.mean, columns, strict=True))}
         # from 1.0 on it takes the groups as one mapping
         return arviz.from_dict(**groups) if arviz.__version__.startswith("0.") else arviz.from_dict(groups)
+
+
+@as_json.register
+def _(drawn: Posterior) -> dict[str, Any]:
+    # without the single samples
+    chains, kinds = drawn.chains, ("mean", "standard_deviation", "interval95")
+    diagnostics = {
+        name: dict(zip(drawn.mean, plain(getattr(chains, name)), strict=True))
+        for name in ("r_hat", "effective_samples")
+    }
+    count, draws, _ = chains.samples.shape
+    sizes = {"chains": count, "draws": draws, "seed": chains.seed, "divergences": chains.divergences}
+    return {
+        "method": drawn.method,
+        "converged": drawn.converged,
+        "reasons": drawn.reasons,
+        "parameters": {name: {kind: getattr(drawn, kind)[name] for kind in kinds} for name in drawn.mean},
+        "chains": sizes | diagnostics,
+    }
 
 
 def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], method: str) -> Posterior:

@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import isotonic_regression
 from scipy.special import ndtr, ndtri
 
+from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE, Sum, chi2_tail, covariance_of, levenberg_marquardt
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.lag import turned
@@ -583,15 +584,17 @@ class EnergyCurve:
         energy, noise, *by = interpolated(ratio, self.amplitude_ratio, *columns)
         return energy, noise, np.stack(by, axis=-1)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return amplitude ratio, height, energy and virial with their bands, and what is said of each point."""
-        names = ("amplitude_ratio", "height_nm", "energy_aj", "energy_low_aj", "energy_high_aj", "virial_aj")
-        half = TWO_SIDED_95 * self.virial_error_aj
-        return {name: getattr(self, name) for name in names} | {
-            "said": [said_of(*ends) for ends in zip(self.energy_low_aj, self.energy_high_aj, strict=True)],
-            "virial_low_aj": self.virial_aj - half,
-            "virial_high_aj": self.virial_aj + half,
-        }
+
+@as_json.register
+def _(curve: EnergyCurve) -> dict[str, Any]:
+    # what is said of each point stands beside its band
+    names = ("amplitude_ratio", "height_nm", "energy_aj", "energy_low_aj", "energy_high_aj", "virial_aj")
+    half = TWO_SIDED_95 * curve.virial_error_aj
+    return {name: getattr(curve, name) for name in names} | {
+        "said": [said_of(*ends) for ends in zip(curve.energy_low_aj, curve.energy_high_aj, strict=True)],
+        "virial_low_aj": curve.virial_aj - half,
+        "virial_high_aj": curve.virial_aj + half,
+    }
 
 
 def interpolated(ratio: Any, measured: np.ndarray, *columns: np.ndarray) -> np.ndarray:

@@ -8,20 +8,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import label_axes, new_figure, png_of
+from afm_jax.report import Bullets, Section, Table, sections
+from afm_jax.saved import as_json
 from afm_jax.strict_json import strict_json
 from afm_jax.units import words_of
 from afm_jax.whole_files import whole_folder, write_whole
-from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.tapping_curves.maps import ARRAYS, PixelState, TappingMap
 
 _MOST = 1024
 """Pixels a side of a picture."""
 
 
-def map_report(result: TappingMap) -> Report:
-    """Return a map as sections: median energy and virial with the two kinds of errors, what is known, notes."""
-    counts, unit, numbers = result.counts, result.unit, result.to_dict()
-    rows, columns = result.state.shape
+@sections.register
+def _(image: TappingMap) -> list[Section]:
+    counts, unit, numbers = image.counts, image.unit, as_json(image)
+    rows, columns = image.state.shape
     masked = [f"{count} {name}" for name, count in counts.items() if count and name != "used"]
     head = ["", f"2.5 % ({unit})", "median", "97.5 %", "error of a pixel", "error of all in common"]
     cells = [
@@ -34,24 +35,19 @@ def map_report(result: TappingMap) -> Report:
         for name, key in (("energy of a tap", "energy"), ("virial", "virial"))
         if counts["used"]
     ]
-    parts = ", ".join(f"{words_of(name)} {value:+.2g}" for name, value in result.common.items())
+    parts = ", ".join(f"{words_of(name)} {value:+.2g}" for name, value in image.common.items())
     common = f"The common error of the energy comes of ({unit}, one standard error each): {parts}."
-    known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
+    known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in image.known.items()]
     of_known = ["known", "value", "unit", "from"]
     table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
-    sections = [
-        ReportSection("Energy and virial", [table]),
-        ReportSection("Errors", [Text(common if cells else "")]),
-        ReportSection("What is known", [Table("Of the instrument", of_known, known, words=of_known[2:])]),
-        ReportSection("Notes", [Bullets(result.notes, "Notes:")]),
+    title = f"Map {image.source}: {rows} x {columns} pixels, {counts['used']} used"
+    return [
+        Section(f"{title}, masked: {', '.join(masked)}" if masked else f"{title}, none masked", []),
+        Section("Energy and virial", [table]),
+        Section("Errors", [common if cells else None]),
+        Section("What is known", [Table("Of the instrument", of_known, known)]),
+        Section("Assumptions", [Bullets(image.notes, "Notes:")]),
     ]
-    return Report(
-        title=f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used, "
-        + (f"masked: {', '.join(masked)}" if masked else "none masked"),
-        valid=result.valid,
-        reasons=result.reasons,
-        sections=sections,
-    )
 
 
 def map_figure(result: TappingMap) -> Figure:
@@ -77,56 +73,55 @@ def map_figure(result: TappingMap) -> Figure:
     return figure
 
 
-def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[Path]:
+def write_map(image: TappingMap, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Write picture, JSON, text and the arrays in the formats wanted, and return their paths.
 
     Args:
-        result: the map.
+        image: the map.
         folder: that is there already.
         formats: of "npz", "gsf" and "zarr".
     """
-    payload = {"format": "afm-jax tapping-map", "format_version": 1, **result.to_dict()}
     contents: dict[str, str | bytes] = {
-        "map.png": png_of(map_figure(result)),
-        "map.json": strict_json(payload) + "\n",
-        "map.txt": text_of(map_report(result)) + "\n",
+        "map.png": png_of(map_figure(image)),
+        "map.json": strict_json(as_json(image)) + "\n",
+        "map.txt": f"{image}\n",
     }
     if "npz" in formats:
         packed = io.BytesIO()
-        arrays = {name: getattr(result, name) for name in (*ARRAYS, "state")}
-        np.savez(packed, allow_pickle=False, **arrays, unit=np.array(result.unit))
+        arrays = {name: getattr(image, name) for name in (*ARRAYS, "state")}
+        np.savez(packed, allow_pickle=False, **arrays, unit=np.array(image.unit))
         contents["map.npz"] = packed.getvalue()
     if "gsf" in formats:
-        contents |= {f"map_{name}.gsf": _simple_field(result, name) for name in ARRAYS}
+        contents |= {f"map_{name}.gsf": _simple_field(image, name) for name in ARRAYS}
     for name, content in contents.items():
         write_whole(folder / name, content)
     if "zarr" in formats:
-        _write_zarr(result, folder / "map.zarr")
+        _write_zarr(image, folder / "map.zarr")
     return [folder / name for name in (*contents, *(["map.zarr"] if "zarr" in formats else []))]
 
 
-def _simple_field(result: TappingMap, name: str) -> bytes:
+def _simple_field(image: TappingMap, name: str) -> bytes:
     """Return an array as a file of Gwyddion's, a Gwyddion Simple Field, in J or m^2; NaN are masked there.
 
     After a head of lines, filled with NUL to a multiple of four bytes, stand numbers of 32 bits, little-endian, row by
     row (Gwyddion's user guide, "Gwyddion simple field files").
     """
-    rows, columns = result.state.shape
-    title, unit = name.replace("_", " "), "J" if result.unit == "aJ" else "m^2"
+    rows, columns = image.state.shape
+    title, unit = name.replace("_", " "), "J" if image.unit == "aJ" else "m^2"
     lines = ["Gwyddion Simple Field 1.0", f"XRes = {columns}", f"YRes = {rows}", f"Title = {title}", f"ZUnits = {unit}"]
-    if result.size_m is not None:
-        lines += [f"XReal = {result.size_m[1]!r}", f"YReal = {result.size_m[0]!r}", "XYUnits = m"]
+    if image.size_m is not None:
+        lines += [f"XReal = {image.size_m[1]!r}", f"YReal = {image.size_m[0]!r}", "XYUnits = m"]
     head = "\n".join([*lines, ""]).encode()
-    return head + b"\0" * (4 - len(head) % 4) + (1e-18 * getattr(result, name)).astype("<f4").tobytes()
+    return head + b"\0" * (4 - len(head) % 4) + (1e-18 * getattr(image, name)).astype("<f4").tobytes()
 
 
-def _write_zarr(result: TappingMap, path: Path) -> None:
+def _write_zarr(image: TappingMap, path: Path) -> None:
     import zarr  # noqa: PLC0415
 
     with whole_folder(path) as fresh:
         group = zarr.open_group(str(fresh), mode="w")
         for name in (*ARRAYS, "state"):
-            array = group.create_array(name, data=getattr(result, name), dimension_names=("rows", "columns"))
-            array.attrs["units"] = "" if name == "state" else result.unit
-        group.attrs["source"], group.attrs["unit"] = result.source, result.unit
-        group.attrs["energy_common_error"] = result.energy_common_error
+            array = group.create_array(name, data=getattr(image, name), dimension_names=("rows", "columns"))
+            array.attrs["units"] = "" if name == "state" else image.unit
+        group.attrs["source"], group.attrs["unit"] = image.source, image.unit
+        group.attrs["energy_common_error"] = image.energy_common_error

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from afm_jax.checks import checked
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, words_of
 from fitting.instruments.images import AmplitudeAndPhase, read_images
@@ -45,7 +46,11 @@ class PixelState(enum.IntEnum):
     NOT_MEASURED = 3
 
 
-@public_result(picture="fitting.tapping_curves.map_report:map_figure", state=PixelState)
+@public_result(
+    picture="fitting.tapping_curves.map_report:map_figure",
+    home="fitting.tapping_curves.map_report",
+    state=PixelState,
+)
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TappingMap(JudgedResult):
     """Energy and virial of a tap in every pixel, NaN where a pixel is out of range or nothing was measured.
@@ -89,18 +94,21 @@ class TappingMap(JudgedResult):
         """How many pixels are in each state, by its name in words."""
         return {state.name.lower().replace("_", " "): int(np.sum(self.state == state)) for state in PixelState}
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all but the arrays, and of these the median and the ends of 95 % of the pixels in range."""
-        used = self.state == PixelState.USED
-        ends = {"percentile_2_5": 2.5, "median": 50.0, "percentile_97_5": 97.5}
-        arrays = {
-            name: {end: np.percentile(getattr(self, name)[used], p) if used.any() else None for end, p in ends.items()}
-            for name in ARRAYS
-        }
-        own = {name: value for name, value in vars(self).items() if name not in {*ARRAYS, "state"}}
-        pixels = {"rows": used.shape[0], "columns": used.shape[1], **self.counts}
-        known = {key: vars(one) for key, one in self.known.items()}
-        return plain(own | arrays | {"valid": self.valid, "pixels": pixels, "known": known})
+
+@as_json.register
+def _(image: TappingMap) -> dict[str, Any]:
+    # all but the arrays, and of these the median and the ends of 95 % of the pixels in range
+    used = image.state == PixelState.USED
+    ends = {"percentile_2_5": 2.5, "median": 50.0, "percentile_97_5": 97.5}
+    arrays = {
+        name: {end: np.percentile(getattr(image, name)[used], p) if used.any() else None for end, p in ends.items()}
+        for name in ARRAYS
+    }
+    own = {name: value for name, value in vars(image).items() if name not in {*ARRAYS, "state"}}
+    pixels = {"rows": used.shape[0], "columns": used.shape[1], **image.counts}
+    known = {key: vars(one) for key, one in image.known.items()}
+    head = {"format": "afm-jax tapping-map", "format_version": 1}
+    return plain(head | own | arrays | {"valid": image.valid, "pixels": pixels, "known": known})
 
 
 @checked

@@ -1,25 +1,13 @@
-"""A tapping curve, and several of one lever, as a person reads them: sections, and the files of --out."""
+"""A tapping curve, and several of one lever, as a person reads them."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
+from afm_jax.report import Bullets, Picture, Section, Table, sections
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from afm_jax.words import interval, percent, with_error
-from fitting.report.files import write_report_files
-from fitting.report.sections import (
-    Bullets,
-    Report,
-    ReportSection,
-    Table,
-    Text,
-    page_of,
-    pictures_of,
-    text_of,
-)
 from fitting.tapping_curves.branches import CurveBranch, Hysteresis
 from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, interpolated, said_of
 from fitting.tapping_curves.result import Tapping
@@ -30,58 +18,51 @@ _CHANGES = {
     "half": "half of the free amplitude is left",
     "branch": "from the attractive to the repulsive branch",
 }
-WriteTable = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
 
 
-def tapping_summary(result: Tapping) -> str:
-    """Return the result as text: verdict, energy, thresholds, speeds, law or what to record instead, notes."""
-    return result.in_unit(text_of(tapping_report(result)))
-
-
-def tapping_report(result: Tapping) -> Report:
-    """Return the result as sections: energy, thresholds, speeds, law or what to record instead, assumptions, notes."""
-    states = result.rows.state
+@sections.register
+def _(taps: Tapping) -> list[Section]:
+    states = taps.rows.state
     kinds = [(states.count(kind), kind) for kind in ("free", "attractive", "repulsive", "touching", "held")]
     counts = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
-    law = f"No impact law: {result.reason}."
-    if result.law is not None:
-        from fitting.report.report import summary  # noqa: PLC0415 - fits import JAX, energies need none
-
-        law = summary(result.law)
-    sections = [
-        *_along_the_branches(result),
-        _one_energy(result),
-        _thresholds(result),
-        _speeds(result),
-        ReportSection("Impact law", [Text(law, "lines" if result.law else "")]),
-        ReportSection("What the numbers assume", [Bullets(result.assumptions, "Assumed:")]),
-        ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
-    ]
-    return Report(
-        title=f"Tapping curve {result.table.source}: {len(states)} rows, {counts}",
-        about=energy_in_words(result),
-        valid=result.valid,
-        reasons=result.reasons,
-        sections=sections,
+    shows = (
+        "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
+        "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
     )
+    title = f"Tapping curve {taps.table.source}: {len(states)} rows, {counts}"
+    return [
+        Section(title, [f"  {line}" for line in energy_in_words(taps)]),
+        Section("Picture", [Picture("fitting.tapping_curves.pictures:curve_figure", shows)]),
+        *_along_the_branches(taps),
+        _one_energy(taps),
+        _thresholds(taps),
+        _speeds(taps),
+        Section("Impact law", [str(taps.law) if taps.law else f"No impact law: {taps.reason}."]),
+        Section("What the numbers assume", [Bullets(taps.assumptions, "Assumed:")]),
+    ]
 
 
-def energy_in_words(result: Tapping) -> list[str]:
+@csv_columns.register
+def _(taps: Tapping) -> CsvColumns:
+    return {"tapping_rows.csv": columns_of(taps.in_unit(taps.records()))}
+
+
+def energy_in_words(taps: Tapping) -> list[str]:
     """Return the energy of a tap in aJ and eV at 0.8 of the free amplitude if measured there, and the largest."""
-    top, over_k = result.largest, result.curve.over_spring_constant
-    if result.bound_aj is not None:
-        electronvolts = "" if over_k else f", {EV_PER_AJ * result.bound_aj:.3g} eV"
-        return [f"Energy of a tap: at most {result.bound_aj:.3g} aJ{electronvolts}"]
-    if top is None or not (result.valid or "only bracketed" in result.why_not_functions):
+    top, over_k = taps.largest, taps.curve.over_spring_constant
+    if taps.bound_aj is not None:
+        electronvolts = "" if over_k else f", {EV_PER_AJ * taps.bound_aj:.3g} eV"
+        return [f"Energy of a tap: at most {taps.bound_aj:.3g} aJ{electronvolts}"]
+    if top is None or not (taps.valid or "only bracketed" in taps.why_not_functions):
         return ["Energy of a tap: not known"]
     # the first line gives the energy at 0.8 of the free amplitude
-    quoted = [one for one in result.energies_at if one["amplitude_ratio"] == 0.8]
+    quoted = [one for one in taps.energies_at if one["amplitude_ratio"] == 0.8]
     places = [(max(quoted, key=lambda one: one["energy_aj"]), "interval95_aj", "Energy of a tap")] if quoted else []
     places.append((top, "interval95", "Largest energy of a tap" if quoted else "Energy of a tap, where it is largest"))
     lines = []
     for at, band, what in places:
         low, high = at[band]
-        where = f"at {at['amplitude_ratio']:.2f} of the free amplitude, {result.branches[at['branch']].name}"
+        where = f"at {at['amplitude_ratio']:.2f} of the free amplitude, {taps.branches[at['branch']].name}"
         electronvolts = "" if over_k else f", {interval(EV_PER_AJ * low, EV_PER_AJ * high)} eV"
         lines.append(f"{what}: {_band_in_words(low, high)} aJ {where} (95 %: {interval(low, high)} aJ{electronvolts})")
     return lines
@@ -97,21 +78,21 @@ def _band_in_words(low: float, high: float) -> str:
     return interval(low, high) if said == "bracket" else f"< {high:.3g}"
 
 
-def _along_the_branches(result: Tapping) -> list[ReportSection]:
+def _along_the_branches(taps: Tapping) -> list[Section]:
     """Return the energy of each branch at some amplitudes, and what is known of the instrument."""
-    functions = result.functions
-    if not result.branches:
+    functions = taps.functions
+    if not taps.branches:
         return []
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
     cells = []
-    for branch in result.branches:
+    for branch in taps.branches:
         ratio = branch.curve.amplitude_ratio
         top = float(ratio[np.argmax(branch.curve.energy_aj)])
         *at, largest = (_band_in_words(*band) for band in branch.curve.at([*HEADLINE, top]).T.tolist())
-        name = branch.name + _of_drive(branch, result.branches)
+        name = branch.name + _of_drive(branch, taps.branches)
         cells.append([name, f"{ratio[0]:.2f} to {ratio[-1]:.2f}", *at, f"{largest} at {top:.2f}"])
     lines = [
-        f"  retract less approach, {result.branches[one['approach']].side}: "
+        f"  retract less approach, {taps.branches[one['approach']].side}: "
         f"{with_error(one['energy_aj'], one['standard_error'])} aJ at A/A0 = {one['amplitude_ratio']:.2f}, where the "
         "difference is largest in units of its error"
         for one in differences_of_ways(functions)
@@ -135,8 +116,8 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     caption = "The instrument as stated, and fitted to its free rows"
     instrument = Table(caption, ["instrument, from statements and free rows", "given", "fitted"], known)
     return [
-        ReportSection("Energy along the branches", [energy, Text("\n".join(lines), "lines")]),
-        ReportSection("Instrument", [instrument, Text(f"  rows about smooth energies: {chi2}", "lines")]),
+        Section("Energy along the branches", [energy, *lines]),
+        Section("Instrument", [instrument, f"  rows about smooth energies: {chi2}"]),
     ]
 
 
@@ -146,11 +127,11 @@ def _of_drive(one: CurveBranch | Hysteresis, others: Sequence[CurveBranch | Hyst
     return f", {one.drive_frequency_khz:g} kHz, {one.free_amplitude_nm:.4g} nm" if several else ""
 
 
-def _one_energy(result: Tapping) -> ReportSection:
+def _one_energy(taps: Tapping) -> Section:
     """Return the one energy of all taps of each branch, where that describes the rows."""
-    fit, epsilon = result.fit, result.epsilon
-    if fit is None or result.why_not_constant:
-        return ReportSection("One energy for all taps", [])
+    fit, epsilon = taps.fit, taps.epsilon
+    if fit is None or taps.why_not_constant:
+        return Section("One energy for all taps", [])
     assumed = (
         "Assuming that every tap of a branch loses the same energy (the curve cannot test it along A sqrt(A0^2 - A^2)):"
     )
@@ -164,26 +145,26 @@ def _one_energy(result: Tapping) -> ReportSection:
     lines = [f"  {chi2}, the free frequency {pull:+.1f} of its errors from what is given"]
     if epsilon["value"] is not None:
         scaled = with_error(epsilon["value"], epsilon["standard_error"])
-        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
+        of_mass = "" if taps.curve.over_spring_constant else f", m = {taps.mass_ng:.4g} ng"
         lines.append(f"  epsilon = 2 E/m = {scaled} nm^2/us^2{of_mass}")
-    return ReportSection("One energy for all taps", [Text(assumed), table, Text("\n".join(lines), "lines")])
+    return Section("One energy for all taps", [assumed, table, *lines])
 
 
-def _thresholds(result: Tapping) -> ReportSection:
+def _thresholds(taps: Tapping) -> Section:
     """Return the heights at which the curve changes, a row for each change."""
     cells = []
-    for one in result.hysteresis:
+    for one in taps.hysteresis:
         heights = (end and (end.offset_nm, end.standard_error) for end in (one.approach, one.retract))
         words = ["-" if found is None else with_error(*found) for found in (*heights, one.width_nm)]
-        cells.append([_CHANGES[one.change] + _of_drive(one, result.hysteresis), *words])
+        cells.append([_CHANGES[one.change] + _of_drive(one, taps.hysteresis), *words])
     head = ["threshold (height in nm)", "approach", "retract", "approach - retract"]
     table = Table("Heights of the sample over the tip's rest position", head, cells)
-    return ReportSection("Thresholds", [table])
+    return Section("Thresholds", [table])
 
 
-def _speeds(result: Tapping) -> ReportSection:
+def _speeds(taps: Tapping) -> Section:
     """Return the speeds of the impacts."""
-    found, words = result.speeds, ""
+    found, words = taps.speeds, ""
     if found is not None:
         here = np.isfinite(found.approach_speed_nm_per_us)
         u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
@@ -191,56 +172,20 @@ def _speeds(result: Tapping) -> ReportSection:
         if len(u):
             known = f"known to {percent(float(np.median(error / u)))} in the median"
             words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
-    return ReportSection("Speeds of the impacts", [Text(words)])
+    return Section("Speeds of the impacts", [words])
 
 
-def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> list[Path]:
-    """Write tapping.html, .txt, .json, .png and tapping_rows.csv, and the report of the law if there is one.
-
-    Args:
-        result: what was found.
-        folder: an existing folder; files of these names are replaced.
-        write_table: called with a file name, records and columns for the CSV file.
-
-    Returns:
-        The files written here (the tables are `write_table`'s).
-
-    Raises:
-        OSError: if a file cannot be written.
-    """
-    shows = (
-        "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
-        "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
-    )
-    written = _write(folder, "tapping", result, tapping_report(result), shows)
-    records = result.in_unit(result.records())
-    write_table("tapping_rows.csv", records, tuple(records[0]))
-    if result.law is None:
-        return written
-    from fitting.report.report import write_report  # noqa: PLC0415
-
-    return [*written, *write_report(result.law, folder, write_table)]
+@csv_columns.register
+def _(whole: TappingTogether) -> CsvColumns:
+    each = whole.curves
+    return {"together.csv": {"curve": [one.table.source for one in each], "valid": [one.valid for one in each]}}
 
 
-def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: Report, shows: str) -> list[Path]:
-    """Write page, text, JSON and picture of a report; texts in the unit that energies have."""
-    # a call without --out needs neither matplotlib nor JAX
-    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-
-    # SVG files have the layout of the PNG drawn before
-    picture = png_of(figure := result.plot())
-    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]))
-    page = result.in_unit(page_of(replace(report, sections=[seen, *report.sections])))
-    kind = "tapping" if name == "tapping" else f"tapping {name}"
-    data = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}
-    text = result.in_unit(text_of(report))
-    return write_report_files(folder, name, text=text, data=data, picture=picture, page=page)
-
-
-def together_report(result: TappingTogether) -> Report:
-    """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
+@sections.register
+def _(whole: TappingTogether) -> list[Section]:
+    # mean and scatter of each branch, and the instrument
     cells = []
-    for one in result.scatter:
+    for one in whole.scatter:
         columns = one.energy_aj, one.energy_scatter_aj, one.energy_own_error_aj, one.energy_common_error_aj
         for ratio in HEADLINE:
             mean, *errors = interpolated(ratio, one.amplitude_ratio, *columns)
@@ -250,40 +195,16 @@ def together_report(result: TappingTogether) -> Report:
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     common = [
-        f"  {one.name}: {with_error(one.value, one.standard_error)} ({one.given})" for one in result.common_nuisances
+        f"  {one.name}: {with_error(one.value, one.standard_error)} ({one.given})" for one in whole.common_nuisances
     ]
-    if result.agreement_p_value is not None:
-        common.append(f"  probability that curves of one instrument disagree more: {result.agreement_p_value:.2g}")
-    return Report(
-        title=f"{len(result.curves)} curves of one lever",
-        valid=result.valid,
-        reasons=result.reasons,
-        sections=[
-            ReportSection("Branches", [Table(caption, head, cells)]),
-            ReportSection("What the curves have in common", [Text("\n".join(common), "lines")]),
-        ],
-    )
-
-
-def together_summary(result: TappingTogether) -> str:
-    """Return what several curves of one lever say together as text."""
-    return result.in_unit(text_of(together_report(result)))
-
-
-def write_together(result: TappingTogether, folder: Path) -> list[Path]:
-    """Write together.html, .txt, .json and .png, what several curves of one lever say.
-
-    Args:
-        result: what was found.
-        folder: an existing folder; files of these names are replaced.
-
-    Returns:
-        The files.
-
-    Raises:
-        OSError: if a file cannot be written.
-    """
+    if whole.agreement_p_value is not None:
+        common.append(f"  probability that curves of one instrument disagree more: {whole.agreement_p_value:.2g}")
     shows = (
         "Energy over the amplitude, each curve and their mean, with the scatter and the error that all have in common."
     )
-    return _write(folder, "together", result, together_report(result), shows)
+    return [
+        Section(f"{len(whole.curves)} curves of one lever", []),
+        Section("Picture", [Picture("fitting.tapping_curves.pictures:together_figure", shows)]),
+        Section("Branches", [Table(caption, head, cells)]),
+        Section("What the curves have in common", common),
+    ]

@@ -1,13 +1,16 @@
 """What `tapping` found, row by row, as one energy, as thresholds and as a law, with everything that went into it."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from afm_jax.outcomes import judge
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
@@ -67,7 +70,9 @@ class TapRows:
         return np.array([state == "free" for state in self.state])
 
 
-@public_result(picture="fitting.tapping_curves.pictures:curve_figure")
+@public_result(
+    picture="fitting.tapping_curves.pictures:curve_figure", home="fitting.tapping_curves.report", whole=False
+)
 @dataclass(frozen=True, kw_only=True)
 class Tapping(JudgedResult):
     """Energy and virial of a tap along the branches of a tapping curve, and the impact law: what `tapping` returns.
@@ -236,28 +241,6 @@ class Tapping(JudgedResult):
             if note.startswith("excluded")
         ]
 
-    def _constant_of(self, branch: TappingBranch) -> dict[str, Any]:
-        """Return whether one energy explains the rows of a branch, and which."""
-        groups = () if self.fit is None or self.why_not_constant else self.fit.groups
-        one = next((one for one in groups if (one.drive, one.repulsive) == (branch.drive, branch.repulsive)), None)
-        found = (None, None, None) if one is None else (one.energy_aj, one.error_aj, one.interval95_aj)
-        names = ("energy_aj", "standard_error_aj", "interval95_aj")
-        return {"constant": one is not None, **dict(zip(names, found, strict=True))}
-
-    def _fits(self) -> dict[str, Any]:
-        """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
-        fit, functions = self.fit, self.functions
-        smooth = {name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")}
-        smooth |= {"valid": not self.why_not_functions, "reason": self.why_not_functions or None}
-        smooth |= {"nuisances": nuisances_as_dict(functions.nuisances)}
-        names = ("chi2", "degrees_of_freedom", "p_value")
-        return {
-            "functions": smooth if functions.branches else None,
-            **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
-            "scale": None if fit is None else fit.scale,
-            "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and not self.why_not_constant else {},
-        }
-
     def records(self) -> list[dict[str, Any]]:
         """Return a mapping per row; what is not known is None."""
         curve = self.curve
@@ -277,50 +260,82 @@ class Tapping(JudgedResult):
         flat = {name: plain(column) for name, column in columns.items()}
         return [{name: column[i] for name, column in flat.items()} for i in range(curve.rows)]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain lists, numbers and strings; what is not known is None."""
-        energy, law = self.energy, None if self.law is None else self.law.to_dict()
-        payload = plain(
-            {
-                "valid": self.valid,
-                "reasons": self.reasons,
-                "warnings": self.warnings,
-                "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
-                "energy_per_tap_reason": energy["reason"] or None,
-                "largest_energy_aj": self.largest,
-                "energies_at": self.energies_at,
-                "way_differences": differences_of_ways(self.functions),
-                "epsilon_nm2_per_us2": self.epsilon,
-                "assumptions": self.assumptions,
-                "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
-                "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
-                "branches": [
-                    {
-                        "drive_frequency_khz": branch.drive_frequency_khz,
-                        "free_amplitude_nm": branch.free_amplitude_nm,
-                        "branch": branch.way,
-                        "repulsive": branch.repulsive,
-                        "rows": len(branch.rows),
-                        **self._constant_of(branch),
-                        "curve": branch.curve.to_dict(),
-                    }
-                    for branch in self.branches
-                ],
-                **self._fits(),
-                "hysteresis": [{**vars(one), "width_nm": one.width_nm} for one in self.hysteresis],
-                "law": None if law is None else law["law"],
-                "reason": self.reason,
-                "fit": law,
-                "rows": self.records(),
-                "set_aside": self.set_aside,
-                "versions": self.versions,
-                "input": {name: value for name, value in vars(self.table).items() if value is not None},
-            }
-        )
-        if not self.curve.over_spring_constant:
-            return payload
-        why = "the spring constant is not known: energies are over it, in nm^2"
-        return {**self.in_unit(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
+    def report(self, folder: str | Path, name: str = "", more: Sequence[Any] = ()) -> list[Path]:
+        """Write this curve into a folder as every result, and the report of its law; return the paths."""
+        law = [] if self.law is None else self.law.report(folder)
+        return [*super().report(folder, name, more), *law]
+
+
+@as_json.register
+def _(taps: Tapping) -> dict[str, Any]:
+    energy, law = taps.energy, None if taps.law is None else as_json(taps.law)
+    payload = plain(
+        {
+            "format": "afm-jax tapping",
+            "format_version": 1,
+            "valid": taps.valid,
+            "reasons": taps.reasons,
+            "warnings": taps.warnings,
+            "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
+            "energy_per_tap_reason": energy["reason"] or None,
+            "largest_energy_aj": taps.largest,
+            "energies_at": taps.energies_at,
+            "way_differences": differences_of_ways(taps.functions),
+            "epsilon_nm2_per_us2": taps.epsilon,
+            "assumptions": taps.assumptions,
+            "phase_sense": {**taps.curve.phase._asdict(), "assumed": taps.curve.phase.assumed},
+            "assumed_errors": {name: USUAL_ERRORS[name] for name in taps.curve.assumed},
+            "branches": [
+                {
+                    "drive_frequency_khz": branch.drive_frequency_khz,
+                    "free_amplitude_nm": branch.free_amplitude_nm,
+                    "branch": branch.way,
+                    "repulsive": branch.repulsive,
+                    "rows": len(branch.rows),
+                    **_constant_of(taps, branch),
+                    "curve": as_json(branch.curve),
+                }
+                for branch in taps.branches
+            ],
+            **_fits(taps),
+            "hysteresis": [{**vars(one), "width_nm": one.width_nm} for one in taps.hysteresis],
+            "law": None if law is None else law["law"],
+            "reason": taps.reason,
+            "fit": law,
+            "rows": taps.records(),
+            "set_aside": taps.set_aside,
+            "versions": taps.versions,
+            "input": {name: value for name, value in vars(taps.table).items() if value is not None},
+        }
+    )
+    if not taps.curve.over_spring_constant:
+        return payload
+    why = "the spring constant is not known: energies are over it, in nm^2"
+    return {**taps.in_unit(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
+
+
+def _constant_of(taps: Tapping, branch: TappingBranch) -> dict[str, Any]:
+    """Return whether one energy explains the rows of a branch, and which."""
+    groups = () if taps.fit is None or taps.why_not_constant else taps.fit.groups
+    one = next((one for one in groups if (one.drive, one.repulsive) == (branch.drive, branch.repulsive)), None)
+    found = (None, None, None) if one is None else (one.energy_aj, one.error_aj, one.interval95_aj)
+    names = ("energy_aj", "standard_error_aj", "interval95_aj")
+    return {"constant": one is not None, **dict(zip(names, found, strict=True))}
+
+
+def _fits(taps: Tapping) -> dict[str, Any]:
+    """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
+    fit, functions = taps.fit, taps.functions
+    smooth = {name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")}
+    smooth |= {"valid": not taps.why_not_functions, "reason": taps.why_not_functions or None}
+    smooth |= {"nuisances": nuisances_as_dict(functions.nuisances)}
+    names = ("chi2", "degrees_of_freedom", "p_value")
+    return {
+        "functions": smooth if functions.branches else None,
+        **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
+        "scale": None if fit is None else fit.scale,
+        "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and not taps.why_not_constant else {},
+    }
 
 
 def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from afm_jax.checks import checked, in_float64
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
@@ -48,7 +49,11 @@ class CurveScatter(CurveBranch):
     energy_common_error_aj: Float[np.ndarray, " points"]
 
 
-@public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
+@public_result(
+    picture="fitting.tapping_curves.pictures:together_figure",
+    home="fitting.tapping_curves.report",
+    whole=False,
+)
 @dataclass(frozen=True, kw_only=True)
 class TappingTogether(JudgedResult):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
@@ -78,11 +83,6 @@ class TappingTogether(JudgedResult):
         return self.lever.minimum.p_value
 
     @property
-    def rows(self) -> list[dict[str, Any]]:
-        """A row a curve: its table, and whether its energy is measured."""
-        return [{"curve": one.table.source, "valid": one.valid} for one in self.curves]
-
-    @property
     def reasons(self) -> list[str]:
         """What makes it no measurement."""
         found = [f"{one['file']}: refused curve {one['curve']}; {one['reason']}" for one in self.refused]
@@ -99,20 +99,21 @@ class TappingTogether(JudgedResult):
         """Return a text or mappings about energies in aJ with the unit that they have, that of the first curve."""
         return self.curves[0].in_unit(said) if self.curves else said
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
-        return self.in_unit(
-            plain(
-                {
-                    "valid": self.valid,
-                    "reasons": self.reasons,
-                    "curves": [one.table.source for one in self.curves],
-                    "common_nuisances": nuisances_as_dict(self.common_nuisances),
-                    "agreement_p_value": self.agreement_p_value,
-                    "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
-                }
-            )
-        )
+
+@as_json.register
+def _(whole: TappingTogether) -> dict[str, Any]:
+    # each curve's own is in `curves`
+    told = {
+        "format": "afm-jax tapping together",
+        "format_version": 1,
+        "valid": whole.valid,
+        "reasons": whole.reasons,
+        "curves": [one.table.source for one in whole.curves],
+        "common_nuisances": nuisances_as_dict(whole.common_nuisances),
+        "agreement_p_value": whole.agreement_p_value,
+        "branches": [{**vars(one), "branch": one.way} for one in whole.scatter],
+    }
+    return whole.in_unit(plain(told))
 
 
 @checked

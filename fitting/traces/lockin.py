@@ -16,10 +16,12 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import check_parameter, checked
-from afm_jax.columns import printed_table, rows_of
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
+from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, ResultTuple, public_result
+from afm_jax.saved import as_json
 from afm_jax.units import within_turn
-from afm_jax.words import bullets, printable
+from afm_jax.words import printable
 from fitting.tables.csv_text import Column, FileSetting, Form, TableError, read_columns
 
 Samples = Float[np.ndarray, " samples"]
@@ -91,29 +93,32 @@ class LockinResult(JudgedResult):
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax lockin`."""
-        return {"format": "afm-jax lockin", "format_version": 2, "valid": self.valid} | vars(self)
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of lockin.csv, a row an order."""
-        names = ("orders", "amplitudes_nm", "amplitude_errors_nm", "phases_deg")
-        columns = ("order", "lockin_amplitude_nm", "lockin_amplitude_error_nm", "phase_deg")
-        return {"lockin.csv": {column: getattr(self, name) for column, name in zip(columns, names, strict=True)}}
+@as_json.register
+def _(read: LockinResult) -> dict[str, Any]:
+    return {"format": "afm-jax lockin", "format_version": 2, "valid": read.valid} | vars(read)
 
-    def printed(self) -> list[Any]:
-        """Return the verdict, the amplitudes, and what a reader should know."""
-        cells: dict[str, Any] = {
-            "drive /": "order:d",
-            "amplitude\nnm": "lockin_amplitude_nm",
-            "+-": "lockin_amplitude_error_nm:.2g",
-            "phase\ndegrees": "phase_deg:.2f",
-        }
-        head = (
-            f"{self.verdict}: order {self.order} of {self.drive_frequency_khz:g} kHz, {self.response_periods} periods"
-        )
-        lines = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
-        return [head, printed_table("", cells, rows_of(self.tables()["lockin.csv"])), *lines]
+
+@csv_columns.register
+def _(read: LockinResult) -> CsvColumns:
+    names = ("orders", "amplitudes_nm", "amplitude_errors_nm", "phases_deg")
+    columns = ("order", "lockin_amplitude_nm", "lockin_amplitude_error_nm", "phase_deg")
+    return {"lockin.csv": {column: getattr(read, name) for column, name in zip(columns, names, strict=True)}}
+
+
+@sections.register
+def _(read: LockinResult) -> list[Section]:
+    cells: dict[str, Cell] = {
+        "drive /": "order:d",
+        "amplitude\nnm": "lockin_amplitude_nm",
+        "+-": "lockin_amplitude_error_nm:.2g",
+        "phase\ndegrees": "phase_deg:.2f",
+    }
+    title = f"Order {read.order} of {read.drive_frequency_khz:g} kHz, {read.response_periods} periods"
+    return [
+        Section(title, []),
+        Section("Amplitudes", [table_of(cells, rows_of(csv_columns(read)["lockin.csv"]))]),
+    ]
 
 
 @checked

@@ -17,6 +17,7 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax.motion.start import state
+from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from fitting.simulated.experiment import drives_of
 from tests.package_scenes import bouncing
@@ -70,10 +71,10 @@ LEFT: dict[str, Callable[[Any], Any]] = {
 
 SAME: dict[str, Callable[[], dict[str, Any]]] = {
     "amplitude_gradients": lambda: vars(fitting.amplitude_gradients(TABLE, "law", {"r": 0.9, "epsilon": 60.0})),
-    "compare": lambda: fitting.compare(TABLE, ("law", "restitution")).to_dict(),
-    "fit": lambda: fitting.fit(TABLE).to_dict(),
-    "invert": lambda: fitting.invert(TABLE).to_dict(),
-    "tapping": lambda: fitting.tapping(EXAMPLES / "tapping_contact.csv").to_dict(),
+    "compare": lambda: as_json(fitting.compare(TABLE, ("law", "restitution"))),
+    "fit": lambda: as_json(fitting.fit(TABLE)),
+    "invert": lambda: as_json(fitting.invert(TABLE)),
+    "tapping": lambda: as_json(fitting.tapping(EXAMPLES / "tapping_contact.csv")),
 }
 """What computes in 64 bits by itself."""
 
