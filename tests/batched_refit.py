@@ -5,7 +5,7 @@ beforehand of an unknown, a measurement as well, about the fitted unknown.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,24 +14,6 @@ from fitting.infer.explain import Explained
 from fitting.infer.instantaneous import Chi2
 from fitting.infer.search import Followed, descend
 from fitting.infer.unknowns import _FACTORS
-
-
-class DataSets(NamedTuple):
-    """Readings, and the means of what is known beforehand of each unknown."""
-
-    read: Float[np.ndarray, "sets rows 3"]
-    mean: Float[np.ndarray, "sets k"]
-
-
-def draw_data(explained: Explained, sets: int, random: np.random.Generator) -> DataSets:
-    """Return data sets as they would have been measured if the fitted unknowns were the truth."""
-    theta, (_, strength) = explained.end.theta, explained.model.prior
-    error = np.where(strength > 0.0, 1.0 / np.where(strength > 0.0, strength, 1.0), 0.0)
-    clean = explained.end.orbits.readings
-    return DataSets(
-        read=clean + noise_of(explained, sets, random),
-        mean=theta + error * random.normal(size=(sets, theta.size)),
-    )
 
 
 def noise_of(explained: Explained, sets: int, random: np.random.Generator) -> Float[np.ndarray, "sets rows 3"]:
@@ -60,11 +42,6 @@ def refitted(explained: Explained) -> Explained:
         return replace(explained, end=end)
     chi2 = Chi2(explained.model, explained.weights)
     return chi2.explained(chi2.descended(explained.end.theta))
-
-
-def fit_data_sets(explained: Explained, data: DataSets) -> list[Explained]:
-    """Return the fit of every data set."""
-    return [refitted(with_data(explained, read, mean)) for read, mean in zip(*data, strict=True)]
 
 
 def chi2_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[np.ndarray, " draws"]:

@@ -1,7 +1,6 @@
 """Tables that no fitted model made: losses outside the families, rows that are wrong, two laws for one table."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -10,8 +9,7 @@ from afm_jax.contact.parameters import PAPER
 from fitting import fit
 from fitting.infer.result import FitResult
 from fitting.parameters import CONTACT_DEFAULT
-from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import amplitudes_and_errors, rows, with_amplitudes
+from tests.fit_tables import amplitudes_and_errors, with_amplitudes
 from tests.impact_tables import bump, contact_impact, deviation, drives, measured, steady_amplitudes, with_loss
 
 pytestmark = pytest.mark.slow
@@ -43,32 +41,6 @@ def test_a_contact_is_valid_and_within_its_band_and_six_rows_off_to_one_side_are
     amplitude[::10] += 3.0 * error[::10]
     result = fit(with_amplitudes(table, amplitude, error), "viscous+delay")
     assert not result.valid or farthest(result, contact) <= 2.0
-
-
-def of_high_orders() -> AmplitudeTable:
-    """Return drives of orders 3 to 5: five frequencies about each resonance, three amplitudes and offsets."""
-    steps = itertools.product((3, 4, 5), (0.97, 0.985, 1.0, 1.01, 1.02), (2.0, 4.0, 8.0))
-    drives_of = [
-        (order, round(180.0 * order * detuning, 3), amplitude, (-1.0, 0.0, 1.0)[(n + n // 3) % 3])
-        for n, (order, detuning, amplitude) in enumerate(steps)
-    ]
-    order, frequency, amplitude, offset = np.array(drives_of).T
-    return rows(
-        drives(),
-        np.zeros(len(order), dtype=int),
-        order=order.astype(np.int64),
-        drive_frequency_khz=frequency,
-        drive_amplitude_nm=amplitude,
-        offset_nm=offset,
-        lines=np.arange(len(order)),
-    )
-
-
-def test_an_honest_table_of_high_orders_is_valid_and_its_law_in_the_band(contact):
-    table = of_high_orders()
-    result = fit(measured(table, steady_amplitudes(table, contact), 0.01, 1), "viscous+delay")
-    assert result.valid, result.reasons
-    assert farthest(result, contact) <= 2.5
 
 
 def test_five_outliers_leave_a_robust_fit_its_law():

@@ -1,6 +1,5 @@
 """The frame of the command line: what is imported when, what goes to which stream, and how a command ends."""
 
-import io
 import json
 import os
 import subprocess
@@ -14,18 +13,15 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from rich.console import Console
 from rich.table import Table
 
 import afm_jax
 import fitting
 from afm_jax import strict_json
-from afm_jax.cli import main, session
+from afm_jax.cli import main
 from afm_jax.cli.command import Command, Output
 from afm_jax.cli.ending import NotValid
 from afm_jax.cli.session import Session
-from afm_jax.columns import printed_table
-from afm_jax.results import text_of_parts
 from afm_jax.words import text_table
 from tests import trial_commands
 from tests.fresh_python import outputs, python
@@ -182,24 +178,6 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
     assert sum(all(cell in line for cell in rows[0]) for line in trial(body).stdout.splitlines()) == 2
 
 
-def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Callable[..., Result]):
-    # a formula is known at all speeds, a result may be without impacts: it is said all the same
-    result = trial(lambda *_: Output(payload={}, impact_speeds=()), "figure2", "--json", function="trial_of_a_scene")
-    told = json.loads(result.stdout)
-    assert (result.exit_code, told.pop("scene")["platform"]["amplitude_nm"]) == (0, 2.0)
-    assert told == LABEL | {"extrapolated": None}
-
-
-def test_tables_to_print_have_dashes_and_words():
-    cells = {"name": "name", "x\nnm": "x", "short": "x:.2f", "good": "ok", "twice": lambda row: 2.0 * (row["x"] or 0.0)}
-    rows = [{"name": "a", "x": 1.23456789, "ok": True}, {"name": "b", "x": None, "ok": np.bool_(0)}]
-    table = printed_table("Title", cells, rows)
-    texts = [["a", "b"], ["1.23457", "-"], ["1.23", "-"], ["yes", "no"], ["2.46914", "0"]]
-    assert [list(column.cells) for column in table.columns] == texts
-    assert [column.justify for column in table.columns] == ["left", "right", "right", "left", "right"]
-    assert all(cell in text_of_parts(["One.", table, None]) for cell in ("One.", "Title", "1.23457"))
-
-
 def test_tables_land_in_the_folder(trial: Callable[..., Result], tmp_path: Path):
     rows = [{"x": 0.1, "ok": True}, {"x": float("nan"), "ok": np.bool_(0)}, {"ok": None}]
     folder = tmp_path / "new" / "folder"
@@ -231,23 +209,6 @@ def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
     code = "import runpy, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "runpy.run_module('afm_jax', run_name='__main__')"
     assert outputs(code, {"PYTHONPATH": str(tmp_path)}, codes=(130,)) == ("", "afm-jax: interrupted\n")
-
-
-def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    clock = [0.0]
-    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: clock[0])
-    screen = io.StringIO()
-    for shown in (session._console, lambda **_: Console(file=screen, force_terminal=True, width=120)):
-        monkeypatch.setattr(session, "_console", shown)
-        clock[0] = 0.0
-        with Session(json=False, out=None).working("computing [9] points (the first run compiles)", "points") as report:
-            for clock[0], done in ((30.0, 100), (33.0, 200)):
-                report(done, 400)
-    said = capsys.readouterr().err.splitlines()
-    assert said == ["100 of 400 points", "200 of 400 points, 33 a second, about 6 s left"]
-    # a terminal
-    assert "computing [9] points: 200 of 400 points, 33 a second, about 6 s left" in screen.getvalue()
-    assert "0:00:33" in screen.getvalue()
 
 
 THREADS = """

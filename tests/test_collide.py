@@ -48,14 +48,6 @@ def test_default_accuracy_is_reached_from_11_times_the_capture_speed(of_mpmath, 
     np.testing.assert_allclose(result.viscous_loss_aj, loss, rtol=1e-7)
 
 
-def test_just_above_capture_the_rebound_is_still_known():
-    speed = 1.001 * CAPTURE
-    result = collide_in_eights(Contact.paper(), speed)
-    expected = exact.collision(exact.ContactParameters(), speed, digits=20)
-    assert result.rebound_speed_nm_per_us[0] == pytest.approx(float(expected.rebound_speed_nm_per_us), rel=1e-9)
-    assert result.collision_delay_us[0] == pytest.approx(float(expected.delay_us), abs=1e-8)
-
-
 OTHERS = [
     {"relative_humidity": 0.01},
     {"modulus_gpa": 1000.0},
@@ -136,15 +128,6 @@ def test_a_batch_is_its_tips_one_by_one():
         for ours, one in zip(result, collide(Contact.paper(), speeds[place]), strict=True):
             # another program for another size: fused differently
             np.testing.assert_allclose(ours[place], one, rtol=1e-12, atol=1e-12)
-
-
-def test_parameters_may_differ_from_tip_to_tip():
-    humidity, mass = jnp.linspace(0.2, 0.8, 3), jnp.linspace(0.5, 2.0, 3)
-    many = collide(Contact.paper(relative_humidity=humidity), jnp.full(3, 25.0), mass)
-    for place in range(3):
-        one = collide(Contact.paper(relative_humidity=float(humidity[place])), 25.0, float(mass[place]))
-        for ours, alone in zip(many, one, strict=True):
-            np.testing.assert_allclose(ours[place], alone, rtol=1e-12, atol=1e-13)
 
 
 def test_contacts_without_junction_are_errors_alone_and_outcomes_in_a_batch():

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
 from afm_jax.cli.values import Numbers
-from afm_jax.contact.collide import capture_speed, collide, collisions, default_speeds
+from afm_jax.contact.collide import capture_speed, collide, default_speeds
 from afm_jax.contact.junction import find_junction
 from tests import answers
 from tests.strict_reading import strictly
@@ -65,21 +65,6 @@ def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any], out
     assert [row["captured"] for row in rows] == ["true", "false", "false", "false", "false"]
     assert rows[0]["rebound_speed_nm_per_us"] == ""
     assert [float(row["rebound_speed_nm_per_us"]) for row in rows[1:]] == paper["rebound_speed_nm_per_us"][1:]
-
-
-def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
-    panels = collisions(Contact.paper(), paper["approach_speed_nm_per_us"]).plot().axes
-    drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
-    np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
-    np.testing.assert_array_equal(next(iter(drawn[1].values())), paper["collision_delay_us"][1:])
-    np.testing.assert_array_equal(drawn[2]["liquid bridge"], paper["bridge_hysteresis_aj"][1:])
-    np.testing.assert_array_equal(drawn[2]["solid junction"], paper["junction_hysteresis_aj"][1:])
-    np.testing.assert_array_equal(drawn[2]["viscous"], paper["viscous_loss_aj"][1:])
-    # the captured range is shaded in each panel
-    for axes in panels:
-        (shade,) = axes.patches
-        end = shade.get_extents().transformed(axes.transData.inverted()).x1
-        assert end == pytest.approx(paper["capture_speed_nm_per_us"])
 
 
 def test_options_and_scenes_reach_the_contact(tmp_path: Path):

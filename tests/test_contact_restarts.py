@@ -16,20 +16,15 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import end_of_contact
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
-from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
-from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.many_tips import tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
-from afm_jax.motion.contact_motion import has_just_left
 from afm_jax.motion.follow import follow_long, state_after
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
-from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
-from afm_jax.studies import accuracy
 from afm_jax.studies.sweep import sweep
 
 QUALITY, MASS, AMPLITUDE_NM, RATIO = 40.0, 1.0, 4.0, 2.02
@@ -106,19 +101,6 @@ def test_the_gap_where_contact_ends_is_that_of_what_lasts_longer():
     assert float(end_of_contact(CONTACTS["hertz"])) == 0.0
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), CONTACTS["wet"], CONTACTS["soft"])
     np.testing.assert_allclose(end_of_contact(both), [4.7, float(end_of_contact(CONTACTS["soft"]))], rtol=1e-12)
-
-
-@pytest.mark.parametrize(("off_nm", "rate", "left"), [(0.0, 1.0, True), (1e-14, 1.0, True), (0.0, -1.0, False)])
-def test_a_tip_has_just_left_where_contact_ends_and_the_gap_opens(off_nm, rate, left):
-    platform, ends = afm.Platform(4.0, 180.0), jnp.asarray(20.0)
-    for sign in (1.0, -1.0):
-        assert bool(has_just_left(platform, ends, 3.0, ends + sign * off_nm, rate)) is left
-    assert not bool(has_just_left(platform, ends, 3.0, ends + 1e-6, 1.0))
-    # a tip that has grazed the sample has a rate of rounding
-    assert bool(has_just_left(platform, ends, 3.0, ends, -1e-15))
-    assert not bool(has_just_left(platform, ends, 3.0, ends, -1e-9))
-    # the phase omega t has the rounding of the time
-    assert bool(has_just_left(platform, ends, 1e6, ends + 1e-9, 1.0))
 
 
 @pytest.mark.slow
@@ -223,30 +205,6 @@ def test_diagrams_and_basins_come_to_the_motion_that_a_simulation_settles_on(set
     assert basins.reason is None
     (main,) = (attractor for attractor in basins.attractors if attractor.name.startswith("(1,1)"))
     assert main.velocity_nm_per_us[0] == pytest.approx(velocity, rel=1e-4)
-
-
-@pytest.mark.slow
-def test_charts_branches_and_sweeps_have_the_orbit_that_a_simulation_settles_on(settled):
-    _, scene, peak = settled
-    at, beside = np.array([AMPLITUDE_NM]), np.array([0.0])
-    chart = stability_chart(scene_family(scene, *MOVING), x_values=at, y_values=beside, last_order=1)
-    assert chart.stable_share == 1.0
-    # the accuracy of charts of contacts
-    assert chart.verdicts.peak_amplitude_nm[0, 0] == pytest.approx(peak, rel=1e-5)
-    found = sweep(scene, [{"parameter": MOVING[0], "list": [AMPLITUDE_NM]}], {"what": "orbits", "orders": [1]})
-    assert float(found["peak_amplitude_nm"][0, 0]) == pytest.approx(peak, rel=1e-5)
-    branches = continue_orbits(scene, 1, ParameterRange(MOVING[0], AMPLITUDE_NM, AMPLITUDE_NM + 0.01)).branches
-    ends = [float(branch.reading.peak_amplitude_nm[np.argmin(branch.parameter)]) for branch in branches]
-    assert min(abs(end / peak - 1.0) for end in ends) < 1e-5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONSERVE[:1])
-def test_integrators_of_others_arrive_at_dry_contacts_at_the_same_times(name, tmp_path):
-    afm.save_scene(scene_of(name), tmp_path / "scene.toml")
-    for row in accuracy.measured(str(tmp_path / "scene.toml"), contacts=3, quick=True)["rows"]:
-        assert "reason" not in row, row
-        assert row["error"] < (1e-3 if row["of"] == "gradient" else 1e-5), row
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ the grazing of a resting and of a driven tip.
 """
 
 import json
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,10 +26,7 @@ from afm_jax import (
     save_scene,
 )
 from afm_jax.cli.main import main
-from afm_jax.dynamics import curves, impact_orbits
-from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
-from afm_jax.dynamics.special_points import at_lost_ends
 from afm_jax.impact.closure import OrbitProblem, closing_residual
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
@@ -330,11 +326,6 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
     assert all(point["peak_amplitude_error_nm"] > 0.0 for point in answer["points"])
 
 
-def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():
-    known = UncertainParameters(("interaction.r",), np.array([0.9]), np.array([[1e-4]]))
-    assert known.without("interaction.r").possible_draws(3).shape == (3, 0)
-
-
 @pytest.mark.slow
 def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     """Without adhesion loops of no speed close at both ends of the sample's motion; a tip can rest above it only."""
@@ -350,47 +341,3 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
     assert "capture" not in ends
     assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)
-
-
-@pytest.mark.parametrize(("before", "last", "kind"), [(np.inf, 1e-6, 3), (0.3, 3e-4, 3), (np.inf, np.inf, None)])
-def test_a_curve_that_is_lost_next_to_a_grazing_has_a_special_point_there(before: float, last: float, kind: int | None):
-    """The root of the line through the last two points; a flight without a lowest point is infinitely far off."""
-
-    def at(place: float, near: float) -> curves.CurvePoint:
-        tests = np.array([1.0, 1.0, 1.0, near, 0.4])
-        return curves.CurvePoint(np.array([1.0, 0.5, place]), np.array([0.0, 0.0, 1.0]), tests, 0.0)
-
-    leg = curves.CurveLeg(at(0.2, before), at(0.3, last), (np.zeros(3), np.zeros(3)), np.zeros(3))
-    with warnings.catch_warnings(action="error"):
-        roots = at_lost_ends(curves.FollowedCurve([leg], ("range", "lost")))
-    assert [root.test for root in roots] == ([] if kind is None else [kind])
-    for root in roots:
-        place = 0.3 if np.isinf(before) else np.interp(0.0, [-before, -last], [0.2, 0.3]) + 0.1 * last / (before - last)
-        np.testing.assert_allclose(root.point.point, [1.0, 0.5, place], rtol=1e-12)
-
-
-@pytest.fixture
-def feeding(monkeypatch: pytest.MonkeyPatch):
-    """Let every impact feed the motion by a hundredth more than it does: no law of the package does.
-
-    The test with it is the last of the file: what JAX has compiled for the others is forgotten before and after.
-    """
-    true = impact_orbits.trace_and_determinant_of
-
-    def more(*arguments):
-        trace, determinant = true(*arguments)
-        return trace, 1.02 * determinant
-
-    monkeypatch.setattr(impact_orbits, "trace_and_determinant_of", more)
-    jax.clear_caches()
-    yield
-    jax.clear_caches()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("feeding")
-def test_multipliers_cross_the_circle_at_a_torus_point():
-    given = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), ImpactLaw(0.985))
-    # undamped, without adhesion D = r^2
-    found = continue_orbits(given, 1, ParameterRange("interaction.r", 0.98, 0.995))
-    assert only(found, "torus") == pytest.approx([1.0 / np.sqrt(1.02)], abs=1e-8)

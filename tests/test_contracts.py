@@ -17,8 +17,6 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.collide import collide, collisions
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.time_course import time_course
-from afm_jax.impact import map as poincare
-from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw, impact_law_of
 from afm_jax.impact.map import iterate_map, next_impact
@@ -157,18 +155,6 @@ def test_one_compilation_serves_all_contacts_and_speeds():
     calls = [(Contact.paper(), jnp.array([12.0, 40.0]))]
     calls += [(Contact.paper(relative_humidity=0.6, modulus_gpa=50.0), jnp.array([13.0, 41.0]))]
     assert traces(collide, calls) == 1
-
-
-def test_calls_without_jit_compile_once_too():
-    for scene, time, velocity in built_in_many_ways()[:1]:
-        next_impact(scene, time, velocity)
-        single_impact_orbits(scene, 1)
-    programs: list[Any] = [poincare._next_impact, vars(orbits_module._single_impact_orbits)["outside"]()]
-    before = [program._cache_size() for program in programs]
-    for order, (scene, time, velocity) in enumerate(built_in_many_ways()):
-        next_impact(scene, time, velocity)
-        single_impact_orbits(scene, np.int64(order + 1) if order % 2 else order + 1)
-    assert [program._cache_size() for program in programs] == before
 
 
 def test_row_sums_of_large_batches_are_right():

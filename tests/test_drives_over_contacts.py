@@ -10,7 +10,6 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import state
-from afm_jax.motion.trajectory import trajectory
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
@@ -52,11 +51,3 @@ def test_a_base_drive_over_a_contact_is_the_sample_moved_the_other_way(shaken, i
         lab, moving = (np.asarray(getattr(run.contacts, name))[:count] for run in (one, other))
         # one motion, rounded twice: 1e-14, stretched by every contact
         np.testing.assert_allclose(lab, moving, rtol=1e-9, err_msg=name)
-
-
-def test_the_deflection_is_the_height_in_the_base_frame(shaken, in_the_base_frame):
-    times = np.linspace(START[0], START[0] + DURATION_US, 501)
-    seen, moving = (trajectory(scene, run, times) for scene, run in (shaken, in_the_base_frame))
-    base = -AMPLITUDE_NM * np.cos(DRIVE * times)
-    np.testing.assert_allclose(seen.position_nm - base, moving.position_nm, rtol=0.0, atol=1e-6)
-    np.testing.assert_array_equal(seen.phase, moving.phase)
