@@ -32,7 +32,7 @@ RESPONSE = f"{OBSERVED}test_a_free_cantilever_responds_as_it_must"
 LAW_MOTION = "tests/test_law_motion.py::"
 COLLIDE = "tests/test_collide.py::"
 COLLISIONS = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[diffrax]"
-STEPS = "tests/test_contact_legs.py::test_steps_in_time_take_a_free_tip_where_collide_does"
+STEPS = "tests/test_simulate_contact.py::test_tenth_crossing_agrees_with_an_independent_integration"
 SOLVE = "tests/test_solve.py::"
 COLLOCATION = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]"
 
@@ -310,7 +310,7 @@ MUTATIONS = {
     ),
     "lanes in need worked on once too often": Mutation(
         "jnp.any(state[2]) & (state[0] {< => <=} self.passes)",
-        "tests/test_contact_legs.py::test_the_few_get_what_each_would_alone[3]",
+        "tests/test_contact_lanes.py::test_the_few_get_what_each_would_alone[3]",
     ),
     "a lane's own tangent taken off": Mutation(
         "total = total {+ => -} slopes[:, place] * along",

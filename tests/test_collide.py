@@ -49,24 +49,15 @@ def test_default_accuracy_is_reached_from_11_times_the_capture_speed(of_mpmath, 
 
 
 OTHERS = [
-    {"relative_humidity": 0.01},
-    {"modulus_gpa": 1000.0},
+    {"modulus_gpa": 0.1},
     {"viscosity_pa_s": 1.005},
     {"bridge_forms_nm": 3.5, "bridge_breaks_nm": 3.5},
     {"mass_ng": 20.0},
-]
-RARE = [
-    {"relative_humidity": 0.99},
-    {"modulus_gpa": 0.1},
-    {"tip_radius_nm": 250.0},
-    {"core_constant_j_m6": 1e-70},
-    {"bridge_forms_nm": 0.13, "bridge_breaks_nm": 0.505},
-    {"effects": ("capillary", "structural", "core", "jkr")},
     {"effects": ("capillary", "core", "viscous", "jkr")},
 ]
 
 
-@pytest.mark.parametrize("changes", [*OTHERS, *(pytest.param(one, marks=pytest.mark.slow) for one in RARE)], ids=str)
+@pytest.mark.parametrize("changes", OTHERS, ids=str)
 def test_other_contacts_agree_with_mpmath(changes):
     mass = changes.get("mass_ng", 1.0)
     contact = Contact.paper(**{name: value for name, value in changes.items() if name != "mass_ng"})

@@ -35,18 +35,6 @@ def test_the_users_own_cache_settings_stand_and_one_that_cannot_be_written_is_ha
     assert start(XDG_CACHE_HOME=str(other), HOME=str(other)) == ["True", "None"]
 
 
-@pytest.mark.slow
-def test_a_user_without_a_home_folder_keeps_nothing():
-    # a user whom the system does not list, as in containers; and a HOME that means another folder wherever one is
-    nobody = "from pathlib import Path\ndef home():\n    raise RuntimeError('no home')\nPath.home = home\n"
-    ask = "import afm_jax\nfrom afm_jax.compilation_cache import cache_folder\n"
-    for before, home in ((nobody, None), ("", "relative")):
-        variables = {"HOME": home, "XDG_CACHE_HOME": None, **UNSET}
-        printed, said = outputs(f"{before}{ask}print(cache_folder(), afm_jax.use_cache())", variables)
-        assert printed == "None None"
-        assert "not kept: there is no home folder: set HOME or XDG_CACHE_HOME" in said
-
-
 def test_no_folder_of_somebody_else_or_that_others_may_write_to_is_private(tmp_path: Path, monkeypatch):
     folder = tmp_path / "afm-jax"
     make_private(folder / "own")
