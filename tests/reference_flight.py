@@ -152,16 +152,6 @@ def collision_delay(k: Constants, u: Number, lib: Any = mp) -> Number:
     return hertz * lib.exp(-lib.log(u) / 5) - lead * (1 / outgoing(k, u, lib) - 1 / u) - offset / u
 
 
-def collision_delay_slope(k: Constants, u: Number) -> Number:
-    """Return d tau/d u_in in us/(nm/us)."""
-    if k.delay is None:
-        return 0 * u
-    hertz, lead, offset = k.delay
-    rebound = outgoing(k, u)
-    lead_part = lead * (outgoing_slope(k, u) / rebound**2 - 1 / u**2)
-    return -hertz * mp.exp(-6 * mp.log(u) / 5) / 5 + lead_part + offset / u**2
-
-
 @high_precision
 def rebound_speed(p: Parameters, approach_speed_nm_per_us: Number) -> Number:
     """Return u_out in nm/us; complex where the tip is captured."""
