@@ -48,12 +48,6 @@ def test_a_complex_line_behind_the_resonance_is_taken_off(slope):
     assert alone.valid == (slope == 0.0)
 
 
-def test_noise_in_quadrature_is_a_floor():
-    clean, floor = synthetic_sweep(phase=False, half_widths=20.0), 0.2
-    result = calibrate(replace(clean, amplitude=np.hypot(clean.amplitude, floor)))
-    assert result.quality_factor.value == pytest.approx(QUALITY_FACTOR, rel=1e-8)
-
-
 def scipy_residual(sweep: Resonance):
     """Return the residual function of (f0 - 90)/half-width, log Q and the linear parameters, and where to start.
 

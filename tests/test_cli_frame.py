@@ -204,22 +204,3 @@ def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
     code = "import runpy, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "runpy.run_module('afm_jax', run_name='__main__')"
     assert outputs(code, {"PYTHONPATH": str(tmp_path)}, codes=(130,)) == ("", "afm-jax: interrupted\n")
-
-
-THREADS = """
-import os, sys
-from afm_jax.__main__ import run
-sys.argv[1:] = ["--version"]
-try:
-    run()
-finally:
-    print(os.environ["OPENBLAS_NUM_THREADS"], os.environ["MKL_NUM_THREADS"], "numpy" in sys.modules)
-"""
-
-
-def test_commands_give_linear_algebra_one_thread_unless_the_user_says_otherwise():
-    unset = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"))
-    for given, threads in (({}, "1 1"), ({"MKL_NUM_THREADS": "3"}, "1 3"), ({"OMP_NUM_THREADS": "2"}, "2 2")):
-        # a library reads it when it is loaded
-        printed = python(THREADS, **unset | given).splitlines()
-        assert printed == [f"afm-jax {afm_jax.__version__}", f"{threads} False"]

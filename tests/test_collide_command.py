@@ -10,7 +10,6 @@ from click.testing import CliRunner
 
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
-from afm_jax.cli.values import Numbers
 from afm_jax.contact.collide import capture_speed, collide, default_speeds
 from afm_jax.contact.junction import find_junction
 from tests import answers
@@ -98,17 +97,6 @@ def test_default_speeds_begin_above_the_capture_speed():
     assert (len(speeds), speeds[-1]) == (20, 200.0)
     assert default_speeds(100.0)[-1] == 1100.0
     assert default_speeds(np.inf)[0] == default_speeds(0.0)[0] == 10.0
-
-
-def test_speeds_are_read():
-    for text, speeds in (
-        ("12:200:47", (12, 59, 106, 153, 200)),
-        ("12:20:5", (12, 17)),
-        (" 30 , 10:12:1", (30, 10, 11, 12)),
-    ):
-        assert Numbers().read(text) == speeds
-    # 0.1 is no binary number: eighty steps of it reach 20 only nearly
-    assert len(Numbers().read("12:20:0.1")) == 81
 
 
 def test_that_all_are_captured_is_a_result():

@@ -3,12 +3,10 @@
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from afm_jax.impact.law_table import coordinate_of
 from fitting import fit
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained, run_of_residuals
@@ -73,26 +71,6 @@ def test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture(explained)
         relative = np.linalg.inv(weights.whitening[row, :2, :2]) / data.read[row, :2, None]
         wanted = 1e-4 + share[row] ** 2 * np.array([2.0, 1.0 / 16.0])
         np.testing.assert_allclose(turn @ relative @ relative.T @ turn, np.diag(wanted), rtol=1e-9, atol=1e-15)
-
-
-def test_the_band_is_how_the_law_of_the_orbits_changes_with_what_is_unknown(explained):
-    law, theta = explained.model.law, explained.end.theta
-    u, count = np.array([25.0, 60.0, 150.0]), len(law.names)
-    program = jax.jit(jax.vmap(lambda table, at: table.speeds(at)[1:], in_axes=(None, 0)))
-
-    def of_orbits(at: np.ndarray) -> np.ndarray:
-        capture = law.capture(at)
-        return np.append(np.array(program(law.table(at), coordinate_of(u, capture))), capture)
-
-    step = 1e-3 * np.sqrt(np.diag(explained.covariance)[:count])
-    slope = [of_orbits(theta[:count] + one) - of_orbits(theta[:count] - one) for one in np.diag(step)]
-    slope = np.array(slope).T / (2.0 * step)
-    found = explained.law_at(u)
-    np.testing.assert_allclose(np.append(found.law, found.capture), of_orbits(theta[:count]), rtol=1e-6)
-    factor = np.append(found.factor.reshape(6, -1), found.capture_factor[None], axis=0)
-    wanted = slope @ explained.covariance[:count, :count] @ slope.T
-    error = np.sqrt(np.diag(wanted))
-    np.testing.assert_allclose(factor @ factor.T / np.outer(error, error), wanted / np.outer(error, error), atol=1e-4)
 
 
 def formula(values: np.ndarray) -> np.ndarray:
