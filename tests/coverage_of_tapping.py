@@ -155,22 +155,17 @@ def law_of(tip: Tip, rng: np.random.Generator):
     return lambda u: np.sqrt(np.maximum((restitution * u) ** 2 - loss * u, (0.05 * u) ** 2))
 
 
-class TwoWays(NamedTuple):
-    """A curve out and back: its table, the truth of each branch, and the heights at which the branch changes."""
-
-    table: AmplitudeTable
-    truths: dict[tuple[bool, bool], Truth]
-    heights_nm: tuple[float, float]
+Sides = dict[tuple[bool, bool], Truth]
 
 
-def two_ways(stated: Stated, rng: np.random.Generator, rows: int = 50) -> TwoWays:
-    """Return a curve that leaves the attractive branch at one height and returns to it farther out.
+def two_ways(stated: Stated, rng: np.random.Generator) -> tuple[AmplitudeTable, Sides, tuple[float, float]]:
+    """Return a curve that leaves the attractive branch at one height and returns to it farther out, and its truth.
 
     The energy is a share of what the air leaves a tap, another on each branch and on each way.
     """
-    tip, step, spacing = GRAPHITE, 0.03 * GRAPHITE.free_nm, 0.6 * GRAPHITE.free_nm / rows
+    tip, step, rows = GRAPHITE, 0.03 * GRAPHITE.free_nm, 50
     most = np.pi * tip.stiffness * tip.free_nm**2 / tip.quality
-    height = -tip.free_nm * 0.98 + spacing * np.arange(rows)
+    height = tip.free_nm * (-0.98 + 0.6 / rows * np.arange(rows))
     changes = -tip.free_nm * rng.uniform(0.78, 0.83), -tip.free_nm * rng.uniform(0.88, 0.92)
     parts, truths = [], {}
     for retract, change in zip((False, True), changes, strict=True):
@@ -182,8 +177,7 @@ def two_ways(stated: Stated, rng: np.random.Generator, rows: int = 50) -> TwoWay
         for state in (False, True):
             truths[retract, state] = Truth(*(column[repulsive == state] for column in truth))
         parts.append(truth)
-    table = table_of(tip, parts[0], stated, rng, back=parts[1])
-    return TwoWays(table, truths, changes)
+    return table_of(tip, parts[0], stated, rng, back=parts[1]), truths, changes
 
 
 def points_of(tip: Tip, result: Tapping, truths: dict[tuple[bool, bool], Truth], stated: Stated) -> Points:
@@ -210,10 +204,10 @@ def random_curve(number: int, stated: Stated) -> Simulated:
     kind = KINDS[number % len(KINDS)]
     rng = np.random.default_rng([number, round(1e6 * stated.frequency)])
     if kind == "two branches":
-        out_and_back = two_ways(stated, rng)
-        result = tapping(out_and_back.table, law=False)
-        points = points_of(GRAPHITE, result, out_and_back.truths, stated)
-        return Simulated(kind, points, hysteresis_off(result, out_and_back.heights_nm), result.valid)
+        table, truths, heights_nm = two_ways(stated, rng)
+        result = tapping(table, law=False)
+        points = points_of(GRAPHITE, result, truths, stated)
+        return Simulated(kind, points, hysteresis_off(result, heights_nm), result.valid)
     if kind == "contact":
         tip, truth = curve_of_contact(*CONTACTS[number % len(CONTACTS)])
     else:

@@ -49,9 +49,6 @@ _EDITS = {
     "test_poincare.py::test_every_end_of_a_flight_is_said": {
         "overlap of late instead of early starts": "overlap = jnp.maximum({- => }delay, 0.0)"
     },
-    "test_poincare.py::test_after_a_capture_the_rows_say_so": {
-        "rows after a capture look alive": "{jnp.where(flies, impact.outcome, Outcome.NOT_REACHED) => impact.outcome}"
-    },
     "test_jacobian.py::test_written_and_automatic_jacobians_have_twelve_digits[start0-delayed]": {
         "flight's Jacobian without the start's shift": "acceleration2 * {(time_by_time - 1.0) => time_by_time}",
         "impact's Jacobian with the delay turned round": "1.0 {+ => -} delay_slope * acceleration_in",
@@ -69,9 +66,6 @@ _EDITS = {
     "test_orbits.py::test_orbits_are_those_of_the_reference[delayed]": {
         "closing condition with the offset counted wrong": "(p.position_per_position {- => +} 1.0) * sigma",
         "determinant of the closing condition with a plus": "m11 * m22 {- => +} m12 * m21",
-    },
-    "test_orbits.py::test_a_ramp_has_no_orbit": {
-        "orbits on a ramp": "amplitude_nm > 0.0){ & (problem.platform.offset_rate_nm_per_us == 0.0) => }"
     },
     "test_polynomial_roots.py::test_a_close_pair_is_told_apart": {
         "bracket that keeps the wrong half": "(value > 0.0) {== => !=} rising"
@@ -116,9 +110,6 @@ _EDITS = {
     "test_fit.py::test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84": {
         "rise of chi2 from zero": "fitted.profile(fitted.explained, place, y){ - end.chi2 => }"
     },
-    "test_profile_intervals.py::test_a_profile_goes_along_a_bent_valley_where_a_straight_step_loses_an_orbit": {
-        "profile that does not shorten its way": "longest = {0.5 *  => }abs(part)"
-    },
     "test_forces.py::test_forces_of_the_paper_are_their_formulas_in_mpmath": {
         "capillary twice as wide": "return self.pull_nn * length, {1.0 => 0.5} / length",
         "structural share without its curvature": "{(1.0 - kelvin / self.tip_radius_nm) => 1.0}",
@@ -156,9 +147,6 @@ _EDITS = {
     },
     "test_observables.py::test_a_slow_approach_has_not_arrived": {
         "an approach that is taken to be over": "rate / np.where(rate < 1.0, 1.0 {- => +} rate, 1.0)"
-    },
-    "test_observables.py::test_a_vibration_that_dies_away_settles_when_it_has": {
-        "a transient that settles while it is large": "if {not  => }transient <= tolerance"
     },
     "test_simulate_contact.py::test_tenth_crossing_agrees_with_an_independent_integration": {
         "a junction that breaks past the bridge": "driven.breaks_nm, ContactPhase.{BRIDGE => DRY}, ContactPhase.DRY)"
@@ -224,19 +212,8 @@ _EDITS = {
     "test_accuracy_promise.py::test_every_level_holds_for_random_contacts[diffrax]": {
         "collisions beside capture in few steps": "_NEAR_CAPTURE = ({-0.02, 0.2 => -0.0, 0.0})"
     },
-    "test_solve.py::test_slots_end_one_by_one_within_their_domain": {
-        "Newton's step taken in full": "step{ if self.damping is None else self.damping(x, step) => }"
-    },
-    "test_solve.py::test_rows_are_solved_each_on_its_own": {
-        "Newton's method content with a small residual or a small step": (
-            "finite & {small & => (small |} np.all(sizes <= settings.step_tolerance, axis=1){ => )}"
-        )
-    },
     "test_solve.py::test_newton_finds_scipys_root_with_the_derivatives_of_differences": {
         "implicit derivative of a system turned round": "return x, {- => }solved_columns("
-    },
-    "test_solve.py::test_a_curve_is_followed_round_its_fold": {
-        "a curve's plane through the origin": "normal @ {(points[0] - guess) => points[0]}"
     },
     "test_solve.py::test_quadrature_of_polynomials_is_exact": {
         "Legendre series with the wrong weights": "(np.arange(count)[:, None] + {0.5 => 1.0})"

@@ -13,7 +13,7 @@ from tests.answers import answer
 
 KHZ, QUALITY, MASS_NG, FREE_NM, RATIO, R, EPSILON = 90.0, 200.0, 16.9, 80.0, 1.03, 0.98, 0.4
 LAW = afm.ImpactLaw(R, EPSILON)
-OMEGA, DRIVE = 2e-3 * np.pi * KHZ, 2e-3 * np.pi * KHZ * RATIO
+OMEGA = 2e-3 * np.pi * KHZ
 
 
 def gamma_of(quality: float) -> complex:

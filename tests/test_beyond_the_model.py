@@ -1,7 +1,5 @@
 """Tables that no fitted model made: losses outside the families, rows that are wrong, two laws for one table."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -70,13 +68,3 @@ def test_what_a_fit_of_the_contact_holds_is_not_exact(truth):
         assert high is None or PAPER[name] < high
     (said,) = [warning for warning in result.warnings if warning.startswith("Assumed, because nothing states it: ")]
     assert "structural_amplitude_n_per_m = 40 +- 12" in said
-
-
-def test_a_quality_factor_that_is_off_and_has_no_error_is_in_the_band(contact):
-    """By 4.5 %: of a law that lacks the drag the slow impacts and Q say the same."""
-    table = drives()
-    wrong = dataclasses.replace(table, quality_factor=1.045 * (table.quality_factor or 0.0), quality_factor_error=None)
-    read = measured(wrong, steady_amplitudes(table, contact), 0.003, 1)
-    result = fit(read, "law+delay")
-    assert result.valid, result.reasons
-    assert np.mean(deviation(result, contact, fastest=400.0)[1] <= 1.0) >= 0.95

@@ -164,10 +164,8 @@ def test_a_curve_in_two_parameters_is_eq_8_all_along(doubled: Continuation):
 
 @pytest.mark.slow
 def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
-    r, epsilon, sigma = 0.95, 60.0, -1.0
-    amplitudes = ParameterRange("platform.amplitude_nm", 0.5, 6.0)
-    second = ParameterRange("platform.reduced_frequency", 0.8, 1.1)
-    found = continue_orbits(scene(4.0, 1.01, r, epsilon), 1, amplitudes, second=second)
+    r, epsilon = 0.95, 60.0
+    found = continue_orbits(scene(4.0, 1.01, r, epsilon), 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
     (captured,), speed = only(found, "capture"), np.sqrt(epsilon) / r
     assert captured == pytest.approx(capture_amplitude(r, epsilon), abs=1e-8)
     # the branch reaches as far: its last point leaves as slowly as it may
@@ -175,20 +173,6 @@ def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
     last = 0 if branch.ends[0] == "capture" else -1
     assert branch.parameter[last] == pytest.approx(captured, abs=1e-4)
     assert 0.0 < branch.reading.rebound_speed_nm_per_us[last, 0] < 0.02 * speed
-
-    # Where the tip and the platform leave one another with no acceleration either, the tip grazes as it leaves: from
-    # there on the captured orbit passes through the platform.
-    def rises(n: float) -> float:
-        height = 0.5 * speed / FREE / np.tan(0.5 * np.pi / n)
-        return (2.0 * n) ** 2 * (height - sigma) - height
-
-    held = root_of(rises, 0.85, 0.95)
-    (curve,) = (curve for curve in found.curves if curve.kind == "capture")
-    (meeting,) = curve.meetings
-    assert (meeting.kind, meeting.second) == ("capture_grazing", pytest.approx(held, abs=1e-8))
-    assert ((curve.second > held) == curve.admissible).all()
-    beyond = continue_orbits(scene(4.0, 0.87, r, epsilon), 1, amplitudes)
-    assert not any(point.admissible for point in beyond.special if point.kind == "capture")
 
     (fold,) = only(found, "fold")
     assert fold == pytest.approx(amplitude_by_law(fold_of(r, epsilon), r, epsilon), abs=1e-8)

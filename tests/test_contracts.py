@@ -17,7 +17,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.jacobian import map_jacobian
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw, impact_law_of
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
 from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
@@ -52,16 +52,6 @@ def orbits(scene: Scene) -> Any:
 
 
 OBJECTS = [impact_law, next_state, three_impacts, jacobian, orbits]
-
-
-def tabulated(scene: Scene, origin: str = "") -> Scene:
-    """Return the scene with a table in place of its formula, of a law that no formula has."""
-    law = impact_law_of(scene)
-    speeds = np.geomspace(1.1 * float(law.capture_speed_nm_per_us), 300.0, 15)
-    rebound = law.rebound_speed(speeds) * (0.98 - 0.01 * np.sin(np.log(speeds)))
-    late = law.collision_delay(speeds) + 0.002 * np.cos(np.log(speeds))
-    table = TabulatedLaw(speeds, rebound, late, delay=law.delay, origin=origin)
-    return Scene(scene.cantilever, scene.platform, table)
 
 
 @cache
@@ -124,12 +114,10 @@ def traces(function: Callable[..., Any], calls: list[tuple[Any, ...]]) -> int:
     return len(traced)
 
 
-def test_one_compilation_serves_all_values_and_tables_of_one_length():
+def test_one_compilation_serves_all_values():
     ways = [(scene, jnp.asarray(t, float), jnp.asarray(v, float)) for scene, t, v in built_in_many_ways()]
     for function in (next_impact, map_jacobian):
         assert traces(function, ways) == 1
-    tables = [tabulated(scene, origin=f"table {row}") for row, scene in enumerate(scenes())]
-    assert traces(impact_law, [(scene,) for scene in tables]) == 1
 
 
 @pytest.mark.slow
