@@ -1,14 +1,9 @@
 """Models compared on one table: information criteria, and which options are about which model."""
 
-from pathlib import Path
-
 import pytest
-from click.testing import CliRunner
 
-from afm_jax.cli.main import main
 from fitting.infer.comparison import compare
-from tests.fit_tables import EXAMPLE, law, table
-from tests.strict_reading import strictly
+from tests.fit_tables import law, table
 
 __all__ = ["law", "table"]
 MODELS = ("law", "restitution", "viscous")
@@ -39,17 +34,3 @@ def test_a_wrong_call_is_no_failed_rival(table):
         compare(table, ("law", "law"))
     with pytest.raises(ValueError, match="the constraint on 'rr' is on no parameter"):
         compare(table, ("law", "viscous"), constraints={"rr": (1.0, 0.1)})
-
-
-@pytest.mark.slow
-def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    def fail(*_, **__):
-        raise OverflowError("math range error")
-
-    # the command has imported the function by its name
-    monkeypatch.setattr("afm_jax.cli.fit.compared_models", fail)
-    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json", "--out", str(tmp_path)])
-    assert done.exit_code == 1
-    assert strictly(done.stdout)["valid"] is True
-    assert "OverflowError: math range error" in done.stderr.splitlines()[-1]
-    assert (tmp_path / "fit.json").exists()
