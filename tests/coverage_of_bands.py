@@ -170,7 +170,7 @@ def of_bands(noise: float, fits: list[Measured]) -> tuple[str, dict[str, bool]]:
     coverage, widest = WANTED[noise]
     line = (
         f"coverage {np.mean([*shares.values()]):.3f}, worst contact {shares[worst]:.2f} (number {worst:g}); worst |z| "
-        f"{np.median(z):.2f} in the median, {z.max():.2f} at most; bands {np.median(growth):.2f} times as wide; "
+        f"{np.median(z):.2f}, {z.max():.2f} at most; bands {np.median(growth):.2f} times as wide; "
         f"chi2/dof {np.median(degree):.2f}; law error {100 * np.median(error):.3f} %"
     )
     return line, {

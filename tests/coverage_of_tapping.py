@@ -239,10 +239,10 @@ def said(name: str, found: list[Simulated]) -> Said:
     share = float(np.median(np.abs(points.off / points.true)))
     largest, covered = float(off.max(where=near, initial=0.0)), float(np.mean(off < TWO_SIDED_95))
     sys.stdout.write(
-        f"{name}: {len(found)} curves, {sum(one.valid for one in found)} valid; energy in its band at {covered:.3f} of "
-        f"{len(off)} points, largest deviation {largest:.1f} errors, median error {median:.2f} of those stated, "
-        f"{of_implied:.2f} of those that noise and instrument imply, {share:.1%} of the energy; virial "
-        f"{np.mean(virial < TWO_SIDED_95):.3f}, {virial.max():.1f}; changes of branch within {hysteresis:.1f} errors\n"
+        f"{name}: {sum(one.valid for one in found)} of {len(found)} valid; {covered:.3f} of {len(off)} energies in "
+        f"their bands, largest deviation {largest:.1f} errors, median {median:.2f} of those stated, {of_implied:.2f} of "
+        f"those implied by noise and instrument, {share:.1%} of the energy; virial {np.mean(virial < TWO_SIDED_95):.3f}, "
+        f"{virial.max():.1f}; changes of branch within {hysteresis:.1f} errors\n"
     )
     return Said(covered, max(largest, hysteresis), max(median, of_implied), share)
 

@@ -22,8 +22,10 @@ from scipy.optimize import brentq
 from tests.reference_driven_motion import BRIDGE, DRY, FOLD, GAP, JUNCTION, LOSS, RATE, TIME, DrivenContact, Motion
 
 __all__ = ["DrivenContact", "follow"]
-SCALES = np.array([0.1, 1.0, 0.01, 1.0])  # gap (nm) or s, rate (nm/us), time (us), loss (aJ): what errors count by
-END, TURN = "end", "turn"  # what follows a leg that the end of the course cuts off; a component that turns ends a step
+# gap (nm) or s, rate (nm/us), time (us), loss (aJ): what errors count by
+SCALES = np.array([0.1, 1.0, 0.01, 1.0])
+# what follows a leg that the end of the course cuts off; a component that turns ends a step
+END, TURN = "end", "turn"
 
 
 @dataclass(kw_only=True)

@@ -24,7 +24,8 @@ ROOT6 = sqrt(6.0)
 FOLD = float(fold())
 
 DRY, BRIDGE, JUNCTION = "dry", "bridge", "junction"
-GAP, RATE, TIME, LOSS = range(4)  # components of the state in contact; in the junction s stands in the gap's place
+# components of the state in contact; in the junction s stands in the gap's place
+GAP, RATE, TIME, LOSS = range(4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +71,8 @@ class Motion:
         self.numbers, self.solid = _contact_numbers(replace(system.contact, effects=effects))
         self.mass = system.mass_ng
         self.omega = RAD_PER_US_PER_KHZ * system.frequency_khz
-        self.damping = 0.0 if system.quality_factor is None else self.omega / system.quality_factor  # 1/us
+        # 1/us
+        self.damping = 0.0 if system.quality_factor is None else self.omega / system.quality_factor
         self.drive = RAD_PER_US_PER_KHZ * system.drive_frequency_khz
         self.amplitude, self.offset, self.ramp = system.amplitude_nm, system.offset_nm, system.offset_rate_nm_per_us
 

@@ -14,10 +14,13 @@ import mpmath
 import numpy as np
 
 DIGITS = 50
-GUARD_DIGITS = 15  # lost on the way, so that DIGITS are right in the result
+# lost on the way, so that DIGITS are right in the result
+GUARD_DIGITS = 15
 
-mp: Any = mpmath.mp  # mpmath makes its functions at run time, where type checkers do not see them
-Number = Any  # an mpmath number, or a float or array where NumPy computes
+# mpmath makes its functions at run time, where type checkers do not see them
+mp: Any = mpmath.mp
+# an mpmath number, or a float or array where NumPy computes
+Number = Any
 Matrix = Any  # an mpmath matrix
 
 Arguments = ParamSpec("Arguments")

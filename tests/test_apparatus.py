@@ -60,19 +60,6 @@ def test_sine_and_cosine_are_right_to_the_last_digit():
     np.testing.assert_allclose(cosine, exact[1], rtol=0, atol=2.3e-16)
 
 
-def test_sine_and_cosine_differentiate_to_each_other_in_every_precision():
-    angles = jnp.linspace(-20.0, 20.0, 101)
-    (sine, cosine), (rising, falling) = jax.jvp(sine_cosine, (angles,), (jnp.full_like(angles, 2.0),))
-    np.testing.assert_array_equal(rising, 2.0 * cosine)
-    np.testing.assert_array_equal(falling, -2.0 * sine)
-    second = jax.vmap(jax.grad(jax.grad(lambda a: sine_cosine(a)[0])))(angles)
-    np.testing.assert_array_equal(second, -sine)
-    single = sine_cosine(angles.astype(jnp.float32))
-    assert single[0].dtype == jnp.float32
-    # Rounding of the angle, 20 * 6e-8, and of the result.
-    np.testing.assert_allclose(single[0], sine, rtol=0, atol=2e-6)
-
-
 def test_the_top_speed_of_a_platform_counts_its_second_tone():
     platform = Platform(4.0, 180.0, second=Tone(1.5, 270.0, 20.0))
     speeds = np.abs(platform.velocity(np.linspace(0.0, 2e3 / 90.0, 200_001)))

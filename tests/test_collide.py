@@ -7,7 +7,6 @@ import pytest
 from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.solve.lanes import LANES
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 
@@ -108,17 +107,6 @@ def test_a_static_contact_loses_its_hysteresis_at_every_speed():
     # 55.75432 aJ: the sum of the static losses, in mpmath
     hysteresis = float(exact.junction(exact.ContactParameters()).hysteresis_aj)
     np.testing.assert_allclose(result.rebound_speed_nm_per_us, np.sqrt(speeds**2 - 2.0 * hysteresis), rtol=1e-11)
-
-
-def test_a_batch_is_its_tips_one_by_one():
-    # more than two blocks, the last one not full, in a shape of its own
-    speeds = np.linspace(5.0, 250.0, 2 * (LANES + 44)).reshape(2, -1)
-    result = collide(Contact.paper(), speeds)
-    assert result.rebound_speed_nm_per_us.shape == speeds.shape
-    for place in ((0, 0), (0, 30), (1, 1), (1, LANES + 43)):
-        for ours, one in zip(result, collide(Contact.paper(), speeds[place]), strict=True):
-            # another program for another size: fused differently
-            np.testing.assert_allclose(ours[place], one, rtol=1e-12, atol=1e-12)
 
 
 def test_contacts_without_junction_are_errors_alone_and_outcomes_in_a_batch():

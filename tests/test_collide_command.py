@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
-from afm_jax.contact.collide import capture_speed, collide, default_speeds
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.junction import find_junction
 from tests import answers
 from tests.strict_reading import strictly
@@ -88,15 +88,6 @@ def test_a_spring_constant_says_the_mass_and_one_that_nothing_says_is_named_as_a
     stated = answer(path, "--speeds", 40)
     assert "notes" not in stated
     assert stated["mass_ng"] == mass_ng
-
-
-def test_default_speeds_begin_above_the_capture_speed():
-    speeds = answer()["approach_speed_nm_per_us"]
-    # four digits
-    np.testing.assert_allclose(speeds[0], 1.1 * 10.93845, rtol=1e-3, atol=0.0)
-    assert (len(speeds), speeds[-1]) == (20, 200.0)
-    assert default_speeds(100.0)[-1] == 1100.0
-    assert default_speeds(np.inf)[0] == default_speeds(0.0)[0] == 10.0
 
 
 def test_that_all_are_captured_is_a_result():
