@@ -240,9 +240,10 @@ def said(name: str, found: list[Simulated]) -> Said:
     largest, covered = float(off.max(where=near, initial=0.0)), float(np.mean(off < TWO_SIDED_95))
     sys.stdout.write(
         f"{name}: {sum(one.valid for one in found)} of {len(found)} valid; {covered:.3f} of {len(off)} energies in "
-        f"their bands, largest deviation {largest:.1f} errors, median {median:.2f} of those stated, {of_implied:.2f} of "
-        f"those implied by noise and instrument, {share:.1%} of the energy; virial {np.mean(virial < TWO_SIDED_95):.3f}, "
-        f"{virial.max():.1f}; changes of branch within {hysteresis:.1f} errors\n"
+        f"their bands, largest deviation {largest:.1f} errors, median {median:.2f} of those stated, "
+        f"{of_implied:.2f} of those implied by noise and instrument, {share:.1%} of the energy; "
+        f"virial {np.mean(virial < TWO_SIDED_95):.3f}, {virial.max():.1f}; "
+        f"changes of branch within {hysteresis:.1f} errors\n"
     )
     return Said(covered, max(largest, hysteresis), max(median, of_implied), share)
 
