@@ -1,4 +1,4 @@
-"""Cantilever, platform, trigonometry and parameters against SciPy, mpmath and their definitions."""
+"""Cantilever, platform and trigonometry against mpmath and their definitions."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Approach curves: the free tip, the law's own loss, orbits in closed form, SciPy, and the way to `tapping`."""
+"""Approach curves: the free tip, the law's own loss, orbits in closed form, and the way to `tapping`."""
 
 from pathlib import Path
 from typing import Any

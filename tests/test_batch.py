@@ -1,4 +1,4 @@
-"""Batches in blocks: the same impacts as one by one, for any batch size, and their derivatives."""
+"""Batches in blocks: the same impacts as one by one, for any batch size."""
 
 import equinox as eqx
 import jax

@@ -1,4 +1,4 @@
-"""Models compared on one table: information criteria, and which options are about which model."""
+"""Models compared on one table: information criteria, and wrong calls."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What a law leaves out: rows' covariance, the law's band and printed parameters, and contacts that are not the law."""
+"""What a law leaves out: the covariance of rows, printed parameters, runs of residuals, and the minimum of all."""
 
 import dataclasses
 from typing import Any
