@@ -6,10 +6,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from afm_jax import Cantilever, ImpactLaw, Platform, Scene, single_impact_orbits
-from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.start import state
-from afm_jax.motion.trajectory import trajectory
+from afm_jax import Scene, single_impact_orbits
 
 FREE_KHZ = 90.0
 OMEGA = 2e-3 * np.pi * FREE_KHZ
@@ -42,24 +39,6 @@ def noisy_bounce(
     white = np.random.default_rng(seed).standard_normal(time.size)
     kept = np.asarray(lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white))
     return time, height + noise * kept, value
-
-
-def law_motion(reduced: float, r: float, *, offset: float = -1.0, amplitude: float = 4.0) -> tuple[Scene, LongRun]:
-    """Return a damped law scene and 600 drive periods of its motion from 5 nm above the platform, upward."""
-    scene = Scene(Cantilever(FREE_KHZ, 40.0), Platform(amplitude, 2.0 * FREE_KHZ * reduced, offset), ImpactLaw(r))
-    period = float(scene.platform.period_us)
-    start = state(0.75 * period, float(scene.platform.position(0.75 * period)) + 5.0, 40.0)
-    return scene, follow_long(scene, start, 600.0 * period)
-
-
-def trace_of_motion(
-    scene: Scene, run: LongRun, *, periods: float, rate: float, noise: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and heights of the end of a motion, with noise relative to their standard deviation."""
-    end = float(run.simulation.final.time_us)
-    time = np.arange(end - periods * float(scene.platform.period_us), end, 1.0 / rate)
-    height = trajectory(scene, run.simulation, time).position_nm
-    return time, height + noise * height.std() * np.random.default_rng(7).standard_normal(time.size)
 
 
 def orbit_heights(scene: Scene, order: int, time: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:

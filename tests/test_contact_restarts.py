@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 import afm_jax as afm
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import end_of_contact
-from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
@@ -138,7 +137,7 @@ def test_six_hundred_and_fifty_periods_have_a_contact_each():
 
 
 @pytest.mark.slow
-def test_sweeps_diagrams_and_basins_come_to_the_orbit():
+def test_sweeps_and_diagrams_come_to_the_orbit():
     scene, path = scene_of("dry"), "platform.amplitude_nm"
     orbit = contact_orbits(scene, 1, 1)
     ends = sweep(scene, [{"parameter": path, "list": [AMPLITUDE_NM]}], {"what": "simulation", "periods": 650.0})
@@ -150,7 +149,3 @@ def test_sweeps_diagrams_and_basins_come_to_the_orbit():
     swept = bifurcation_diagram(scene, path, np.array([AMPLITUDE_NM]), impacts=650)
     assert swept.verdicts.names() == ["(1,1)"]
     assert swept.velocity_after_nm_per_us[0, -1] == pytest.approx(velocity, rel=1e-4)
-    basins = basins_of_attraction(scene, columns=2, rows=2, speeds_nm_per_us=(20.0, 60.0))
-    assert basins.reason is None
-    (main,) = (attractor for attractor in basins.attractors if attractor.name.startswith("(1,1)"))
-    assert main.velocity_nm_per_us[0] == pytest.approx(velocity, rel=1e-4)

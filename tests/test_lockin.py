@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fitting import LockinResult, TableError, lockin, read_trace
-from tests.lockin_traces import bounce, law_motion, noisy_bounce, orbit_heights, trace_of_motion
+from fitting import LockinResult, lockin, read_trace
+from tests.lockin_traces import bounce, noisy_bounce, orbit_heights
 from tests.package_scenes import bouncing
 
 SEEDS = 40
@@ -84,19 +84,6 @@ def test_errors_are_the_scatter_over_seeds(periods: float, memory: float):
     assert np.all(np.abs(np.mean(pulls, axis=0)) < 4.0 / np.sqrt(SEEDS))
 
 
-@pytest.mark.parametrize(
-    ("reduced", "r", "order", "valid"),
-    [(1.7, 0.6, 2, True), (1.7, 0.6, 1, False), (1.7, 0.6, 3, False), (1.3, 0.6, 1, False), (1.3, 0.9, 1, False)],
-)
-def test_motions_of_the_law_are_periodic_at_their_order_alone(reduced, r, order, valid):
-    """The simulation says (1,2) at 1.7 with r = 0.6, (2,2) at 1.3, and nothing periodic with r = 0.9."""
-    scene, run = law_motion(reduced, r)
-    time, height = trace_of_motion(scene, run, periods=150.0, rate=20.0, noise=0.02)
-    result = lockin(time, height, float(scene.platform.frequency_khz), order)
-    assert result.valid == valid, result.reasons
-    assert valid or result.reasons[0].startswith(f"not periodic at order {order}: ")
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_what_is_not_periodic_at_the_order_is_flagged(noise: float):
     time = np.arange(0.0, 800.0, 0.1)
@@ -131,32 +118,6 @@ def test_sampling_in_step_with_several_drive_periods_makes_no_subharmonics(per_p
     assert "beside" not in (others.reason or ""), others.reason
 
 
-def test_few_phases_in_step_with_the_drive_are_stated_as_an_error():
-    time = np.arange(0.0, 40.0 * 1e3 / DRIVE - 1e-9, 1e3 / DRIVE / 8.0)
-    height, value = bounce(time, order=1, drive_khz=DRIVE)
-    result = lockin(time, height, DRIVE, 1)
-    off = abs(result.lockin_amplitude_nm - abs(value))
-    # aliasing is a bias: the stated error covers it, and is not ten times too large
-    assert off < result.lockin_amplitude_error_nm < 20.0 * off
-    assert any("Few phases are sampled" in warning for warning in result.warnings)
-
-
-def test_faults_of_traces_in_memory():
-    time = np.arange(0.0, 100.0, 0.1)
-    height, _ = bounce(time, order=1, drive_khz=DRIVE)
-    for columns, order, said in (
-        ((time, height), 5, "too short for 4 periods of order 5; record at least 110 us"),
-        ((np.delete(time, 500), np.delete(height, 500)), 1, "sample 501, column time_us: the step is 0.2 us"),
-        ((time[::-1], height), 1, "the step is"),
-        ((time[::20], height[::20]), 1, "samples in a drive period; sample 4 or more"),
-        ((time, np.full(1000, np.nan)), 1, "finite numbers"),
-    ):
-        with pytest.raises(TableError, match=said):
-            lockin(*columns, DRIVE, order)
-    with pytest.raises(ValueError, match="`order` must be 1 to 8, but is 9"):
-        lockin(time, height, DRIVE, 9)
-
-
 @pytest.mark.parametrize("sign", [",", "\t", ";", "  ", ", "])
 @pytest.mark.parametrize(("unit", "size"), [("us", 1.0), ("s", 1e-6)])
 def test_text_of_any_separator_is_read_back(tmp_path: Path, sign: str, unit: str, size: float):
@@ -170,10 +131,3 @@ def test_text_of_any_separator_is_read_back(tmp_path: Path, sign: str, unit: str
     # units are powers of ten
     np.testing.assert_allclose(trace.time_us, time, rtol=1e-14)
     np.testing.assert_array_equal(trace.deflection_nm, height)
-
-
-def test_a_setting_of_another_file_is_refused_not_left_among_the_remarks(tmp_path: Path):
-    path = tmp_path / "trace.csv"
-    path.write_text("# quality_factor = 40\ntime_us\tdeflection_nm\n0\t1\n1\t2\n", encoding="utf-8")
-    with pytest.raises(TableError, match="line 1: quality_factor sets nothing in such a file; remove the line"):
-        read_trace(path)
