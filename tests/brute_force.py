@@ -18,9 +18,11 @@ Floats = NDArray[np.float64]
 SAMPLES_PER_PERIOD = 64
 INTERVALS = 64
 LEVELS = 3
-BLOCK = 1024  # flights at once: 65 samples each stay in the cache
+# flights at once: 65 samples each stay in the cache
+BLOCK = 1024
 GRAZING_NM = 1e-9
-ROUNDING = 2e-15  # of the gap, in units of the flight's amplitude
+# of the gap, in units of the flight's amplitude
+ROUNDING = 2e-15
 
 
 class Flights(NamedTuple):

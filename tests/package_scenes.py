@@ -63,8 +63,3 @@ def next_impacts(scenes: Scene, times: Any, velocities: Any) -> Any:
         blocks.append(_batch(lanes, np.asarray(times)[index], np.asarray(velocities)[index]))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *blocks)
     return eqx.tree_at(lambda rows: rows.outcome, joined, joined.outcome.astype(int))
-
-
-def repeated(scene: Scene, count: int) -> Scene:
-    """Return one scene `count` times, as a batch."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), scene)

@@ -136,7 +136,8 @@ def junction_time(k: Constants, s: Number, turn: Number) -> Number:
     dt = |dD|/sqrt(2 (E - U)/m), and E - U = (s_turn - s) q(s) with a polynomial q; s = s_turn - y^2 takes the root's
     singularity away. Towards the fold of a tip that all but sticks, q nearly vanishes: the interval is graded there.
     """
-    quotient = [mp.mpf(0)]  # synthetic division, from the highest power
+    # synthetic division, from the highest power
+    quotient = [mp.mpf(0)]
     for coefficient in jkr_potential_coefficients(k)[:0:-1]:
         quotient.insert(0, quotient[0] * turn + coefficient)
 

@@ -9,12 +9,16 @@ from typing import Any, NamedTuple
 
 import mpmath
 
-mp: Any = mpmath.mp  # mpmath makes its functions at run time, where type checkers do not see them
-Number = Any  # an mpmath number; in parameters also a float (its exact value) or a decimal string
+# mpmath makes its functions at run time, where type checkers do not see them
+mp: Any = mpmath.mp
+# an mpmath number; in parameters also a float (its exact value) or a decimal string
+Number = Any
 
 DIGITS = 30
-GUARD_DIGITS = 10  # lost on the way, so that the digits asked for are right in the result
-GAS_CONSTANT = "8.31446261815324"  # J/(mol K), exact in the SI
+# lost on the way, so that the digits asked for are right in the result
+GUARD_DIGITS = 10
+# J/(mol K), exact in the SI
+GAS_CONSTANT = "8.31446261815324"
 EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
 
 
@@ -72,12 +76,15 @@ def constants(p: ContactParameters) -> Constants:
     radius = mp.mpf(p.tip_radius_nm)
     kelvin = kelvin_radius(p)
     decay = mp.mpf(p.structural_decay_nm)
-    meniscus = radius * mp.sin(mp.acos(1 - 2 * kelvin / radius))  # effective radius a of eq. 13
+    # effective radius a of eq. 13
+    meniscus = radius * mp.sin(mp.acos(1 - 2 * kelvin / radius))
     structural = mp.mpf(p.structural_amplitude_n_per_m) * decay * mp.exp(mp.mpf(p.structural_offset_nm) / decay)
     structural *= 1 - mp.exp(-(meniscus**2) / (2 * radius * decay))
-    core = mp.mpf(p.core_constant_j_m6) * mp.mpf(10) ** 72  # J m^6 = 1e18 aJ (1e9 nm)^6
+    # J m^6 = 1e18 aJ (1e9 nm)^6
+    core = mp.mpf(p.core_constant_j_m6) * mp.mpf(10) ** 72
     adhesion = mp.pi * mp.mpf(p.adhesion_energy_j_per_m2)
-    viscosity = mp.mpf(p.viscosity_pa_s) / 1000  # Pa s = 1e-3 nN us/nm^2
+    # Pa s = 1e-3 nN us/nm^2
+    viscosity = mp.mpf(p.viscosity_pa_s) / 1000
     return Constants(
         capillary=4 * mp.pi * radius * mp.mpf(p.surface_tension_n_per_m) * ("capillary" in p.effects),
         reach=2 * kelvin,

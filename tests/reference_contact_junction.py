@@ -21,7 +21,8 @@ from tests.reference_contact_forces import (
 )
 
 SMALLEST_GAP_NM = 0.005
-GAP_RATIO = 0.98  # of the scan for the tangency; two of them closer than this are taken for none
+# of the scan for the tangency; two of them closer than this are taken for none
+GAP_RATIO = 0.98
 
 
 class Junction(NamedTuple):

@@ -12,7 +12,6 @@ Written from the equations alone and sharing nothing with the package. Units are
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import cos, exp, hypot, inf, pi, radians, sin, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,15 +24,8 @@ ROOT6 = sqrt(6.0)
 FOLD = float(fold())
 
 DRY, BRIDGE, JUNCTION = "dry", "bridge", "junction"
-GAP, RATE, TIME, LOSS = range(4)  # components of the state in contact; in the junction s stands in the gap's place
-
-
-class Start(NamedTuple):
-    """Time, and the tip's position and velocity in the lab."""
-
-    time_us: float
-    position_nm: float
-    velocity_nm_per_us: float
+# components of the state in contact; in the junction s stands in the gap's place
+GAP, RATE, TIME, LOSS = range(4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +47,10 @@ class DrivenContact:
     viscous: bool = True
     structural: bool = True
 
-    def start(self, *, phase_deg: float, height_nm: float, velocity_nm_per_us: float) -> Start:
-        """Return the start at a drive phase and a height above the platform, with a velocity in the lab."""
+    def start(self, *, phase_deg: float, height_nm: float, velocity_nm_per_us: float) -> tuple[float, float, float]:
+        """Return time, position and velocity in the lab of a start at a drive phase and a height above the platform."""
         time = radians(phase_deg) / (RAD_PER_US_PER_KHZ * self.drive_frequency_khz)
-        return Start(time, Motion(self).platform(time)[0] + height_nm, velocity_nm_per_us)
+        return time, Motion(self).platform(time)[0] + height_nm, velocity_nm_per_us
 
 
 @lru_cache
@@ -79,7 +71,8 @@ class Motion:
         self.numbers, self.solid = _contact_numbers(replace(system.contact, effects=effects))
         self.mass = system.mass_ng
         self.omega = RAD_PER_US_PER_KHZ * system.frequency_khz
-        self.damping = 0.0 if system.quality_factor is None else self.omega / system.quality_factor  # 1/us
+        # 1/us
+        self.damping = 0.0 if system.quality_factor is None else self.omega / system.quality_factor
         self.drive = RAD_PER_US_PER_KHZ * system.drive_frequency_khz
         self.amplitude, self.offset, self.ramp = system.amplitude_nm, system.offset_nm, system.offset_rate_nm_per_us
 
@@ -129,7 +122,7 @@ class Motion:
         free = -(self.omega**2) * (base + gap) - self.damping * (base_rate + rate)
         return force / self.mass + free - base_acceleration
 
-    def bridge_rates(self, start: float, _: float, state: np.ndarray) -> list[float]:
+    def bridge_rates(self, start: float, state: np.ndarray) -> list[float]:
         """Return the time derivatives of gap, its rate, time since `start` and viscous loss in the bridge."""
         k = self.numbers
         gap, rate, time, _ = state.tolist()
@@ -137,7 +130,7 @@ class Motion:
         force = k.structural * exp(-gap / k.decay) - k.capillary / (1 + gap / k.reach) + k.core / gap**8 - drag
         return [rate, self.acceleration(force, gap, rate, start + time), 1.0, drag * rate]
 
-    def junction_rates(self, start: float, _: float, state: np.ndarray) -> list[float]:
+    def junction_rates(self, start: float, state: np.ndarray) -> list[float]:
         """Return the derivatives of s, gap rate, time since `start` and loss by theta in the junction."""
         s, rate, time, _ = state.tolist()
         force = self.numbers.junction_force * (s**6 - ROOT6 * s**3)

@@ -4,7 +4,8 @@ from typing import Any
 
 from tests.reference_flight import Parameters
 
-DELAY = (0.206, 5.64, 0.726)  # the contact model's, physics.md
+# the contact model's, physics.md
+DELAY = (0.206, 5.64, 0.726)
 
 
 def scene(reduced: float = 1.01, **changes: Any) -> Parameters:

@@ -14,10 +14,13 @@ import mpmath
 import numpy as np
 
 DIGITS = 50
-GUARD_DIGITS = 15  # lost on the way, so that DIGITS are right in the result
+# lost on the way, so that DIGITS are right in the result
+GUARD_DIGITS = 15
 
-mp: Any = mpmath.mp  # mpmath makes its functions at run time, where type checkers do not see them
-Number = Any  # an mpmath number, or a float or array where NumPy computes
+# mpmath makes its functions at run time, where type checkers do not see them
+mp: Any = mpmath.mp
+# an mpmath number, or a float or array where NumPy computes
+Number = Any
 Matrix = Any  # an mpmath matrix
 
 Arguments = ParamSpec("Arguments")
@@ -150,16 +153,6 @@ def collision_delay(k: Constants, u: Number, lib: Any = mp) -> Number:
         return 0 * u
     hertz, lead, offset = k.delay
     return hertz * lib.exp(-lib.log(u) / 5) - lead * (1 / outgoing(k, u, lib) - 1 / u) - offset / u
-
-
-def collision_delay_slope(k: Constants, u: Number) -> Number:
-    """Return d tau/d u_in in us/(nm/us)."""
-    if k.delay is None:
-        return 0 * u
-    hertz, lead, offset = k.delay
-    rebound = outgoing(k, u)
-    lead_part = lead * (outgoing_slope(k, u) / rebound**2 - 1 / u**2)
-    return -hertz * mp.exp(-6 * mp.log(u) / 5) / 5 + lead_part + offset / u**2
 
 
 @high_precision

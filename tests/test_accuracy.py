@@ -2,34 +2,22 @@
 
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene
-from afm_jax.motion.record import State
-from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import load_scene, save_scene
 from afm_jax.studies import accuracy
 from afm_jax.studies import timing as own_process
 from tests import reference_contact as exact
 from tests import reference_map
 from tests.answers import answer, table
-from tests.reference_driven_contact import DrivenContact, follow
 from tests.reference_flight import Parameters
-from tests.run_here import answered_with, run_here
+from tests.run_here import run_here
 
-SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
-START = {"phase_deg": 270.0, "height_nm": 5.0, "velocity_nm_per_us": 60.0}
 FORCED = Scene(
     Cantilever(90.0, 200.0, 16.8), Platform(0.0, 94.5, -30.0), ImpactLaw(0.95, 60.0), force=ForceDrive(60.0, 94.5)
 )
-
-
-@pytest.fixture(scope="module")
-def course():
-    """Contacts of an independent integration to 12 digits; from this start some of the first twenty-five turn."""
-    return follow(SYSTEM, *SYSTEM.start(**START), contacts=25)
 
 
 def test_the_reference_of_the_map_is_that_of_mpmath():
@@ -70,19 +58,6 @@ def test_the_reference_of_collisions_is_that_of_mpmath():
 
 
 @pytest.mark.slow
-def test_the_reference_of_a_contact_scene_is_that_of_an_independent_integration(course):
-    scene = contact_scene(5.277, 4.0, 0.0)
-    start = State(
-        *(jnp.asarray(part) for part in SYSTEM.start(phase_deg=270.0, height_nm=5.0, velocity_nm_per_us=60.0))
-    )
-    last = course.contacts[2]
-    until = jnp.asarray(last.departure_time_us + 1e-3)
-    found = accuracy.times_of_contact(scene, 3, until, accuracy.IN_TIME[0], start)[0]
-    # two contacts multiply rounding and step errors by less than a thousand
-    assert float(found) == pytest.approx(last.arrival_time_us, abs=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["forced", "figure9b"])
 def test_law_scenes_are_measured_however_they_are_driven(scene: str, tmp_path: Path):
     """SciPy and Diffrax know nothing of steady responses and closed forms, and arrive at the same time."""
@@ -97,14 +72,6 @@ def test_law_scenes_are_measured_however_they_are_driven(scene: str, tmp_path: P
         # times of 20 us; the slope grows where the tip is slow
         assert row["error"] < (1.0 if coarse else 1e-4 if row["of"] == "gradient" else 1e-6), row
     assert {row["method"] for row in found["rows"]} == {"afm-jax", "SciPy DOP853", "Diffrax Dopri8"}
-
-
-@pytest.mark.slow
-def test_a_tip_with_fewer_contacts_is_refused(tmp_path: Path):
-    path = tmp_path / "captured.toml"
-    save_scene(Scene(Cantilever(90.0, 40.0), Platform(0.5, 174.6, 5.0), ImpactLaw(0.998, 122.0)), path)
-    with pytest.raises(ValueError, match="not as many as 5 contacts"):
-        accuracy.contact_arrivals(str(path), 5)
 
 
 @pytest.mark.slow
@@ -125,20 +92,3 @@ def test_achieved_errors_are_what_settings_allow(problem: str, tmp_path: Path, m
         assert 1e-14 < errors["value", method, "tolerance 1e-08"] < 1e-5
         assert 1e-12 < errors["gradient", method, "tolerance 1e-08"] < 1e-3
     assert len(table(tmp_path / "accuracy.csv")) == len(payload["rows"])
-
-
-def test_command_tells_all_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    rows = [
-        {"of": of, "method": method, "setting": "a", "microseconds": 1.0, "error": error, "compile_s": 1.0}
-        for of in ("value", "gradient")
-        for method, error in (("afm-jax", 1e-9), ("SciPy DOP853", 1e-5), ("Diffrax Dopri8", 0.0))
-    ]
-    rows.append({"of": "value", "method": "SciPy DOP853", "setting": "b", "microseconds": None, "error": None})
-    rows[-1]["reason"] = "gave up"
-    study = {"rows": rows, "value_of": "arrival of contact 10 (us)", "reference": "a finer one"}
-    study |= {"reference_error": 1e-12, "reference_gradient_error": 0.0}
-    monkeypatch.setattr(own_process, "run_in_own_process", answered_with(study))
-    payload = answer(tmp_path, "accuracy", "figure9b")
-    assert payload["problem"] == "figure9b"
-    assert payload["rows"] == rows
-    assert {path.name for path in tmp_path.iterdir()} == {"accuracy.csv", "accuracy.json", "accuracy.png"}

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,11 +11,10 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax.checks import check_kind
-from afm_jax.contact.forces import Capillary, Dmt, Hertz, VanDerWaals
+from afm_jax.contact.forces import Dmt, Hertz, VanDerWaals
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.scenefile.scenefile import load_scene
 from tests.fresh_python import python
-from tests.writing_commands import EXAMPLES
 
 # in a program of its own: here annotations are checked by the tests' own means first
 PROGRAM = """
@@ -74,59 +74,32 @@ def with_platform(platform: afm.Platform) -> afm.Scene:
     return afm.Scene(SCENE.cantilever, platform, SCENE.interaction)
 
 
-def grid(**changes: Any) -> Any:
-    return fitting.drive_grid(
-        **{"orders": [1], "amplitudes_nm": [4.0], "detunings": [1.0], "free_frequency_khz": 90.0} | changes
-    )
-
-
 # what scene files can hold, too, is refused by tests/malformed.jsonl
 IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.Cantilever(TWO[:0]), "`frequency_khz` must be a number or an array .*, but holds none"),
-    (lambda: afm.simulate(SCENE, START, 9.0, method="x"), "`method` must be one of collocation, diffrax"),
-    (lambda: afm.simulate(SCENE, START, 9.0, max_contacts=0), "`max_contacts` must be 1 or more, but is 0"),
     (lambda: afm.simulate(SCENE, START, TWO), r"`duration_us` must be one number, but has the shape \(2,"),
     (lambda: afm.next_impact(SCENE, TWO, 30.0), r"`time_us` must be one number.*: `iterate_batch` and"),
-    (lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3), r"`time_us` must be one number, but has the shape \(0,"),
-    (lambda: afm.next_impact(SCENE, 0.0, 30.0, max_steps=0), "`max_steps` must be 1 or more, but is 0"),
-    (lambda: afm.iterate_map(SCENE, 0.0, 30.0, 1, root_tolerance_us=-1.0), "`root_tolerance_us` must be pos"),
     (lambda: afm.map_jacobian(SCENE, np.nan, 30.0), "`time_us` must be a finite number, but is nan"),
-    (lambda: afm.many_impact_orbits(SCENE, 1, 2, starts=0), "`starts` must be 1 or more, but is 0"),
     (
         lambda: afm.stability_chart(lambda *_: SCENE, x_values=TWO[:0], y_values=TWO, last_order=1),
         "`x_values` must be rising numbers, one at least",
     ),
-    (lambda: afm.time_course(afm.Contact.paper(), TWO), "`approach_speed_nm_per_us` must be one number"),
-    (lambda: afm.capture_speed(afm.Contact.paper(), TWO), "`mass_ng` must be one number"),
     (lambda: afm.scene_family(SCENE, *["interaction.r"] * 2), "named twice: interaction.r, interaction.r"),
-    (lambda: grid(drive="x"), "`drive` must be one of sample, force, base, but is 'x'"),
-    (lambda: grid(free_frequency_khz=-1.0), "`free_frequency_khz` must be positive, but is -1"),
     # a cantilever, platforms and laws
     (lambda: afm.Platform(np.array([1.0, -2.0, 3.0]), 180.0), "`amplitude_nm` must not be negative, but is -2"),
-    (lambda: afm.Platform(np.array([1.0, 1e40]), 180.0), r"at most 1e\+30"),  # its square is no number
-    (lambda: afm.iterate_map(SCENE, 4.0, 60.0, 0), "`impacts` must be 1 or more, but is 0"),
+    # its square is no number
+    (lambda: afm.Platform(np.array([1.0, 1e40]), 180.0), r"at most 1e\+30"),
     (lambda: afm.iterate_batch(SCENE, np.zeros((2, 1)), TWO, 1), "must have one shape"),
-    (lambda: afm.iterate_batch(SCENE, TWO, TWO, 0), "`impacts` must be 1 or more, but is 0"),
-    (lambda: afm.iterate_batch(SCENE, TWO[:0], TWO[:0], 1), "at least one row"),
     # forces and contacts
     (lambda: afm.Contact((VanDerWaals(),), Hertz()), r"Hertz\(\) is a contact without other forces; VanDerWaals\(\)"),
-    (lambda: afm.Contact((Capillary(),), Dmt()), r"Capillary\(\) is a force of the liquid bridge"),
-    (lambda: afm.Contact((), Hertz(), range_nm=3.0), "`range_nm` is that of a contact with Dmt"),
     (lambda: afm.Contact((VanDerWaals(),), Dmt(), range_nm=0.1), "must be larger than `contact_distance_nm` of 0.165"),
-    (lambda: afm.Contact.of(["van_der_waals", "hertz"]), "'van_der_waals' with 'hertz': Hertz's contact has no other"),
-    (lambda: afm.Contact.of(["capillary", "dmt"]), "'capillary' with 'dmt': there is no liquid bridge"),
-    (lambda: afm.Contact.of(["van_der_waals", "core", "jkr"]), "'van_der_waals' must hold 'dmt'"),
-    (lambda: afm.Contact.of(["dmt", "jkr"]), "'jkr' with 'dmt'"),
-    (lambda: afm.collide(PAPER, 20.0, 0.0), "`mass_ng` must be positive"),
     (
         lambda: afm.collide(afm.Contact.paper(viscosity_pa_s=np.full(3, 1e-3)), TWO),
         r"speeds' shape \(2,\), but one has \(3,\)",
     ),
-    (lambda: afm.time_course(NO_JUNCTION, 20.0), "has no junction"),
     (lambda: afm.time_course(afm.Contact.paper(tip_radius_nm=5.0), 3.0), "turns the tip round"),
     # contacts in time
     (lambda: afm.simulate(WET, afm.State(0.0, 3.95, 60.0), 20.0), "inside the sample"),
-    (lambda: afm.simulate(WET, START, 20.0, accuracy=1e-15), "accuracy"),
     (lambda: afm.simulate(afm.Scene(WET.cantilever, WET.platform, NO_JUNCTION), START, 20.0), "no junction"),
     # motions that do not repeat
     (
@@ -144,14 +117,10 @@ def test_impossible_sizes_numbers_and_words_are_one_line(call: Any, message: str
     assert "\n" not in str(told.value)
 
 
-def test_a_family_without_scenes_and_a_sweep_into_a_file_are_named(tmp_path: Path):
-    with pytest.raises(TypeError, match=r"`scene_of\(...\)` must be a Scene, but is 1"):
-        afm.stability_chart(lambda *_: 1, x_values=TWO, y_values=TWO, last_order=1)  # pyright: ignore[reportArgumentType]
+def test_a_sweep_into_a_file_is_refused(tmp_path: Path):
     (tmp_path / "file").touch()
-    axes = [{"parameter": "platform.amplitude_nm", "list": [1.0, 2.0]}]
-    for out in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(NotADirectoryError, match="is no folder, or lies in none; choose another `out`"):
-            afm.sweep(SCENE, axes, "orbits", out=out)
+    with pytest.raises(NotADirectoryError, match="is no folder, or lies in none; choose another `out`"):
+        afm.sweep(SCENE, [{"parameter": "platform.amplitude_nm", "list": [1.0, 2.0]}], "orbits", out=tmp_path / "file")
 
 
 @pytest.mark.slow
@@ -162,13 +131,10 @@ def test_arguments_of_another_kind_are_named():
 
 
 def test_scenes_are_loaded_from_paths_and_presets_and_tables_read_from_paths(tmp_path: Path):
-    scene = load_scene("figure3")
     path = tmp_path / "scene.toml"
-    afm.save_scene(scene, path)
-    wanted = afm.single_impact_orbits(scene, 1)
+    afm.save_scene(SCENE, path)
     for given in ("figure3", path, str(path)):
-        found = afm.single_impact_orbits(afm.load_scene(given), 1)
-        np.testing.assert_array_equal(found.phase_rad, wanted.phase_rad)
+        assert jax.tree.leaves(afm.load_scene(given)) == jax.tree.leaves(SCENE)
         # as functions check their arguments; here annotations are checked by the tests' own means first
         with pytest.raises(TypeError, match=r"`scene` must be a Scene, but is .*: `afm_jax\.load_scene` makes one"):
             check_kind("scene", given, afm.Scene)
@@ -177,6 +143,3 @@ def test_scenes_are_loaded_from_paths_and_presets_and_tables_read_from_paths(tmp
     for function in (fitting.fit, fitting.calibrate, fitting.read_trace):
         with pytest.raises(fitting.TableError, match="there is no such file"):
             function(tmp_path / "none.csv")
-    table = EXAMPLES / "amplitudes_law.csv"
-    fitting.write_table(table, tmp_path / "again.csv")
-    assert fitting.read_table(tmp_path / "again.csv").rows == fitting.read_table(table).rows

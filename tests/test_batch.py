@@ -1,6 +1,4 @@
-"""Batches in blocks: the same impacts as one by one, for any batch size, and their derivatives."""
-
-from dataclasses import replace
+"""Batches in blocks: the same impacts as one by one, for any batch size."""
 
 import equinox as eqx
 import jax
@@ -12,8 +10,6 @@ from afm_jax import Scene, iterate_map
 from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.map import iterate_batch
 from afm_jax.scenefile.scenefile import load_scene
-from tests.reference_flight import Parameters, high_precision, mp
-from tests.reference_map import iterate
 
 IMPACTS = 3
 
@@ -41,40 +37,6 @@ def test_blocks_change_nothing(batch: int, block: int, monkeypatch: pytest.Monke
         expected = np.stack([np.asarray(getattr(one, name)) for one in alone])
         # the same operations in another order of fused multiplications: a few roundings, grown by three impacts
         np.testing.assert_allclose(np.asarray(getattr(rows, name)), expected, rtol=1e-12, atol=1e-12)
-
-
-@high_precision
-def derivatives_by_r(scene: Scene, time_us: float, velocity: float) -> list[float]:
-    """Return d(impact times)/dr in us by a central difference at 50 digits, right to about 30."""
-    law, step = scene.interaction, mp.mpf("1e-15")
-    quality = scene.cantilever.quality_factor
-    own = Parameters(
-        frequency_khz=float(scene.cantilever.frequency_khz),
-        quality_factor=None if quality is None else float(quality),
-        amplitude_nm=float(scene.platform.amplitude_nm),
-        drive_frequency_khz=float(scene.platform.frequency_khz),
-        offset_nm=float(scene.platform.offset_nm),
-        r=float(law.r),
-        epsilon=float(law.epsilon),
-        viscous_loss=float(law.viscous_loss),
-    )
-    up, down = (iterate(replace(own, r=mp.mpf(own.r) + shift), time_us, velocity, IMPACTS) for shift in (step, -step))
-    return [float((high.time_us - low.time_us) / (2 * step)) for high, low in zip(up, down, strict=True)]
-
-
-def test_forward_and_reverse_derivatives_agree_with_50_digits(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("afm_jax.impact.map.BLOCK", 2)
-    scene = load_scene("figure2")
-    starts = scattered_starts(scene, 3)
-
-    def times(r: jax.Array) -> jax.Array:
-        return iterate_batch(with_r(scene, r), *starts, IMPACTS).time_us
-
-    r = scene.interaction.r
-    exact = [derivatives_by_r(scene, float(time), float(speed)) for time, speed in zip(*starts, strict=True)]
-    for derivative in (jax.jacfwd, jax.jacrev):
-        # three impacts lose at most three digits of sixteen
-        np.testing.assert_allclose(np.asarray(jax.jit(derivative(times))(r)), np.array(exact), rtol=1e-12, atol=1e-13)
 
 
 def test_a_parameter_of_another_length_is_named():

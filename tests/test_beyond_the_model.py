@@ -1,8 +1,5 @@
 """Tables that no fitted model made: losses outside the families, rows that are wrong, two laws for one table."""
 
-import dataclasses
-import itertools
-
 import numpy as np
 import pytest
 
@@ -10,8 +7,7 @@ from afm_jax.contact.parameters import PAPER
 from fitting import fit
 from fitting.infer.result import FitResult
 from fitting.parameters import CONTACT_DEFAULT
-from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import amplitudes_and_errors, rows, with_amplitudes
+from tests.fit_tables import amplitudes_and_errors, with_amplitudes
 from tests.impact_tables import bump, contact_impact, deviation, drives, measured, steady_amplitudes, with_loss
 
 pytestmark = pytest.mark.slow
@@ -45,32 +41,6 @@ def test_a_contact_is_valid_and_within_its_band_and_six_rows_off_to_one_side_are
     assert not result.valid or farthest(result, contact) <= 2.0
 
 
-def of_high_orders() -> AmplitudeTable:
-    """Return drives of orders 3 to 5: five frequencies about each resonance, three amplitudes and offsets."""
-    steps = itertools.product((3, 4, 5), (0.97, 0.985, 1.0, 1.01, 1.02), (2.0, 4.0, 8.0))
-    drives_of = [
-        (order, round(180.0 * order * detuning, 3), amplitude, (-1.0, 0.0, 1.0)[(n + n // 3) % 3])
-        for n, (order, detuning, amplitude) in enumerate(steps)
-    ]
-    order, frequency, amplitude, offset = np.array(drives_of).T
-    return rows(
-        drives(),
-        np.zeros(len(order), dtype=int),
-        order=order.astype(np.int64),
-        drive_frequency_khz=frequency,
-        drive_amplitude_nm=amplitude,
-        offset_nm=offset,
-        lines=np.arange(len(order)),
-    )
-
-
-def test_an_honest_table_of_high_orders_is_valid_and_its_law_in_the_band(contact):
-    table = of_high_orders()
-    result = fit(measured(table, steady_amplitudes(table, contact), 0.01, 1), "viscous+delay")
-    assert result.valid, result.reasons
-    assert farthest(result, contact) <= 2.5
-
-
 def test_five_outliers_leave_a_robust_fit_its_law():
     impact = contact_impact(relative_humidity=0.3, adhesion_energy_j_per_m2=0.2)
     table = measured(drives(), steady_amplitudes(drives(), impact), 0.003, 2)
@@ -98,13 +68,3 @@ def test_what_a_fit_of_the_contact_holds_is_not_exact(truth):
         assert high is None or PAPER[name] < high
     (said,) = [warning for warning in result.warnings if warning.startswith("Assumed, because nothing states it: ")]
     assert "structural_amplitude_n_per_m = 40 +- 12" in said
-
-
-def test_a_quality_factor_that_is_off_and_has_no_error_is_in_the_band(contact):
-    """By 4.5 %: of a law that lacks the drag the slow impacts and Q say the same."""
-    table = drives()
-    wrong = dataclasses.replace(table, quality_factor=1.045 * (table.quality_factor or 0.0), quality_factor_error=None)
-    read = measured(wrong, steady_amplitudes(table, contact), 0.003, 1)
-    result = fit(read, "law+delay")
-    assert result.valid, result.reasons
-    assert np.mean(deviation(result, contact, fastest=400.0)[1] <= 1.0) >= 0.95

@@ -14,7 +14,6 @@ from afm_jax.columns import csv_columns
 from fitting import calibrate, read_resonance
 from fitting.calibration.calibrate import CalibratedValue
 from fitting.calibration.sweep import Resonance
-from fitting.tables.csv_text import TableError
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
 
 REAL = Path(__file__).parent.parent.parent / "shared" / "data" / "free_resonance_nanonis.dat"
@@ -48,20 +47,6 @@ def test_a_complex_line_behind_the_resonance_is_taken_off(slope):
     # by the amplitude alone, whose background is a constant, a slope makes Q wrong by more than 10 standard errors
     alone = calibrate(replace(sweep, phase_deg=None))
     assert alone.valid == (slope == 0.0)
-
-
-def test_interference_with_the_background_is_taken_off_an_amplitude():
-    sweep = synthetic_sweep(noise=1e-3, background=0.1 + 0.05j, phase=False)
-    result = calibrate(sweep)
-    assert result.valid, result.reasons
-    # |A L + B|^2 is taken up to terms of the order 1/Q^2; 4 standard errors are 0.3 % of Q
-    assert abs(result.quality_factor.value / QUALITY_FACTOR - 1.0) < 3e-3
-
-
-def test_noise_in_quadrature_is_a_floor():
-    clean, floor = synthetic_sweep(phase=False, half_widths=20.0), 0.2
-    result = calibrate(replace(clean, amplitude=np.hypot(clean.amplitude, floor)))
-    assert result.quality_factor.value == pytest.approx(QUALITY_FACTOR, rel=1e-8)
 
 
 def scipy_residual(sweep: Resonance):
@@ -131,21 +116,6 @@ def test_intervals_cover_the_truth(phase, given):
     assert np.mean(pulls) == pytest.approx(0.0, abs=4.0 / np.sqrt(2 * count))
 
 
-def test_errors_follow_the_noise_they_are_told():
-    sweep = synthetic_sweep(noise=0.01, given=False)
-    scaled = calibrate(sweep)
-    errors = (noise * np.full(sweep.points, sweep.amplitude.max()) for noise in (0.01, 0.02))
-    told, doubled = (calibrate(replace(sweep, amplitude_error=error)) for error in errors)
-    # 240 residuals: the noise is found to 1/sqrt(480), here 3 of those
-    assert scaled.error_origin == "estimated"
-    # the noise of 0.01 is that of the largest amplitude measured, which is 5 nm
-    assert scaled.quality_factor.standard_error == pytest.approx(told.quality_factor.standard_error, rel=0.15)
-    assert scaled.chi2 == pytest.approx(scaled.degrees_of_freedom, rel=1e-9)
-    assert np.isnan(scaled.p_value)
-    assert doubled.chi2 == pytest.approx(told.chi2 / 4.0, rel=1e-9)
-    assert doubled.quality_factor.standard_error == pytest.approx(2.0 * (told.quality_factor.standard_error or 0.0))
-
-
 @pytest.mark.parametrize("reverse", [1.0, -1.0])
 def test_order_of_the_points_and_sign_and_turns_of_the_phase_do_not_matter(reverse):
     sweep = synthetic_sweep(noise=1e-3)
@@ -181,20 +151,6 @@ def test_what_is_no_calibration_is_not_valid(sweep, said):
     assert result.table_comments == []
 
 
-def test_noise_or_nothing_is_no_resonance():
-    random, khz = np.random.default_rng(3), np.linspace(89.0, 91.0, 80)
-    noise: dict[str, Any] = {
-        "amplitude": 1.0 + 0.02 * random.standard_normal(80),
-        "phase_deg": random.uniform(-2.0, 2.0, 80),
-    }
-    result = calibrate(Resonance(frequency_khz=khz, **noise))
-    assert not result.valid
-    assert any("No resonance stands out" in reason for reason in result.reasons)
-    flat = Resonance(frequency_khz=khz, amplitude=np.zeros(80), phase_deg=np.linspace(0.0, 90.0, 80))
-    with pytest.raises(TableError, match="is the same at every frequency; sweep across a resonance"):
-        calibrate(flat)
-
-
 def test_the_measured_sweep():
     if not REAL.exists():
         pytest.skip("the measured sweep lies outside this checkout")
@@ -210,13 +166,6 @@ def test_the_measured_sweep():
     alone = calibrate(replace(real_sweep, phase_deg=None)).quality_factor
     # the amplitude alone: 1218.84 +- 1.21 by SciPy
     assert (alone.value, alone.standard_error) == (pytest.approx(1218.84, abs=0.1), pytest.approx(1.21, abs=0.1))
-
-
-def test_a_frequency_in_hz_under_the_name_of_khz_is_pointed_out():
-    sweep = synthetic_sweep(noise=1e-3, phase=False)
-    assert not any("are in Hz" in warning for warning in calibrate(sweep).warnings)
-    wrong = replace(sweep, frequency_khz=1e3 * sweep.frequency_khz)
-    assert any("name their column frequency_hz" in warning for warning in calibrate(wrong).warnings)
 
 
 @pytest.mark.slow

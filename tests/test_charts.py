@@ -20,13 +20,6 @@ def chart_of(scene_of) -> StabilityChart:
     )
 
 
-def adhesion_limit_nm(reduced_frequency: np.ndarray) -> np.ndarray:
-    """Return the drive amplitude below which adhesion leaves no orbit: beta omega = sqrt((1 - r^2) epsilon)/2r."""
-    r = presets.STABILITY_R
-    top_speed = np.sqrt((1.0 - r**2) * presets.ADHESION) / (2.0 * r)
-    return top_speed / (2e-3 * np.pi * 2.0 * presets.FREE_FREQUENCY_KHZ * reduced_frequency)
-
-
 @pytest.mark.parametrize("epsilon", [0.0, presets.ADHESION])
 def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float):
     chart = chart_of(presets.figure3_scene if epsilon else presets.figure2_scene)
@@ -66,29 +59,3 @@ def test_at_resonance_an_orbit_needs_a_drive_that_reaches_the_rest_position(orde
     height = 3.0 * platform_speed / (2e-3 * np.pi * 90.0)
     # V' is a closed form; rounding only
     np.testing.assert_allclose(verdicts.peak_amplitude_nm[0, 2:], height, rtol=1e-9)
-
-
-def test_no_orbit_where_adhesion_takes_more_than_the_platform_gives():
-    """On an undamped orbit v_p = (u_in - u_out)/2, at least sqrt((1 - r^2) epsilon)/2r by eq. 6."""
-    frequency = np.linspace(0.6, 6.4, 200)
-    for factor, some in ((0.999, False), (1.05, True)):
-        scenes = batch_of_scenes(presets.figure3_scene, frequency, factor * adhesion_limit_nm(frequency))
-        assert orbit_verdicts(scenes, range(1, 9)).admissible.any() == some
-
-
-@pytest.mark.parametrize(("n", "side"), [(0.97, -1.0), (1.03, 1.0)])
-def test_elastic_limit_of_the_amplitude(n: float, side: float):
-    """For r -> 1 the platform stands still at impact: half a free oscillation about 0 from z = sigma -+ beta."""
-    offset = np.array([-0.2, 0.0, 0.2])
-    scenes = batch_of_scenes(presets.figure9_scene, np.full(3, n), offset, np.full(3, 0.9999))
-    height = (offset + side * 0.75) / np.cos(np.pi / (2.0 * n))
-    # 1 - r = 1e-4, with the square root of the loss's effect on the phase: some parts in a thousand
-    np.testing.assert_allclose(orbit_verdicts(scenes, [1]).peak_amplitude_nm[0], height, rtol=5e-3)
-
-
-@pytest.mark.slow
-def test_orders_above_14_add_nothing():
-    figure2 = chart_of(presets.figure2_scene)
-    frequency, amplitude = (column.reshape(60, 124)[::2, ::2].ravel() for column in figure2.points())
-    higher = orbit_verdicts(batch_of_scenes(presets.figure2_scene, frequency, amplitude), range(15, 21))
-    assert (higher.any_stable() & ~figure2.any_stable[::2, ::2].ravel()).mean() < 1e-3

@@ -10,8 +10,7 @@ from click.testing import CliRunner
 
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
-from afm_jax.cli.values import Numbers
-from afm_jax.contact.collide import capture_speed, collide, collisions, default_speeds
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.junction import find_junction
 from tests import answers
 from tests.strict_reading import strictly
@@ -67,21 +66,6 @@ def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any], out
     assert [float(row["rebound_speed_nm_per_us"]) for row in rows[1:]] == paper["rebound_speed_nm_per_us"][1:]
 
 
-def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
-    panels = collisions(Contact.paper(), paper["approach_speed_nm_per_us"]).plot().axes
-    drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
-    np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
-    np.testing.assert_array_equal(next(iter(drawn[1].values())), paper["collision_delay_us"][1:])
-    np.testing.assert_array_equal(drawn[2]["liquid bridge"], paper["bridge_hysteresis_aj"][1:])
-    np.testing.assert_array_equal(drawn[2]["solid junction"], paper["junction_hysteresis_aj"][1:])
-    np.testing.assert_array_equal(drawn[2]["viscous"], paper["viscous_loss_aj"][1:])
-    # the captured range is shaded in each panel
-    for axes in panels:
-        (shade,) = axes.patches
-        end = shade.get_extents().transformed(axes.transData.inverted()).x1
-        assert end == pytest.approx(paper["capture_speed_nm_per_us"])
-
-
 def test_options_and_scenes_reach_the_contact(tmp_path: Path):
     path = tmp_path / "scene.toml"
     contact = Contact.paper(effects=EFFECTS, modulus_gpa=80.0, relative_humidity=0.45)
@@ -104,26 +88,6 @@ def test_a_spring_constant_says_the_mass_and_one_that_nothing_says_is_named_as_a
     stated = answer(path, "--speeds", 40)
     assert "notes" not in stated
     assert stated["mass_ng"] == mass_ng
-
-
-def test_default_speeds_begin_above_the_capture_speed():
-    speeds = answer()["approach_speed_nm_per_us"]
-    # four digits
-    np.testing.assert_allclose(speeds[0], 1.1 * 10.93845, rtol=1e-3, atol=0.0)
-    assert (len(speeds), speeds[-1]) == (20, 200.0)
-    assert default_speeds(100.0)[-1] == 1100.0
-    assert default_speeds(np.inf)[0] == default_speeds(0.0)[0] == 10.0
-
-
-def test_speeds_are_read():
-    for text, speeds in (
-        ("12:200:47", (12, 59, 106, 153, 200)),
-        ("12:20:5", (12, 17)),
-        (" 30 , 10:12:1", (30, 10, 11, 12)),
-    ):
-        assert Numbers().read(text) == speeds
-    # 0.1 is no binary number: eighty steps of it reach 20 only nearly
-    assert len(Numbers().read("12:20:0.1")) == 81
 
 
 def test_that_all_are_captured_is_a_result():

@@ -1,16 +1,9 @@
-"""Models compared on one table: information criteria, and which options are about which model."""
-
-import dataclasses
-from pathlib import Path
+"""Models compared on one table: information criteria, and wrong calls."""
 
 import pytest
-from click.testing import CliRunner
 
-from afm_jax.cli.main import main
-from fitting.infer import comparison
 from fitting.infer.comparison import compare
-from tests.fit_tables import EXAMPLE, law, table
-from tests.strict_reading import strictly
+from tests.fit_tables import law, table
 
 __all__ = ["law", "table"]
 MODELS = ("law", "restitution", "viscous")
@@ -36,55 +29,8 @@ def test_models_are_compared_by_their_information(compared):
     assert "decides for law: a restitution with adhesion" in compared.verdict
 
 
-def test_known_fits_are_not_made_again_and_a_constraint_goes_to_the_models_that_have_it(table, law, monkeypatch):
-    asked = {}
-
-    def noted(_, model, **options):
-        asked[model] = options["constraints"]
-        return dataclasses.replace(law, model=model)
-
-    monkeypatch.setattr(comparison, "fit", noted)
-    known = {"law": law}
-    found = compare(
-        table, ("law", "viscous"), known=known, constraints={"r": (0.95, 0.01), "quality_factor": (40.0, 1.0)}
-    )
-    assert found.results["law"] is known["law"]
-    assert asked == {"viscous": {"quality_factor": (40.0, 1.0)}}
-
-
 def test_a_wrong_call_is_no_failed_rival(table):
     with pytest.raises(ValueError, match="at least two different models"):
         compare(table, ("law", "law"))
     with pytest.raises(ValueError, match="the constraint on 'rr' is on no parameter"):
         compare(table, ("law", "viscous"), constraints={"rr": (1.0, 0.1)})
-
-
-@pytest.mark.slow
-def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    def fail(*_, **__):
-        raise OverflowError("math range error")
-
-    # the command has imported the function by its name
-    monkeypatch.setattr("afm_jax.cli.fit.compared_models", fail)
-    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json", "--out", str(tmp_path)])
-    assert done.exit_code == 1
-    assert strictly(done.stdout)["valid"] is True
-    assert "OverflowError: math range error" in done.stderr.splitlines()[-1]
-    assert (tmp_path / "fit.json").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Path):
-    arguments = ["fit", str(contact_table_path), "--model", "restitution+delay", "--compare", "--json"]
-    done = CliRunner().invoke(main, arguments)
-    answer = strictly(done.stdout)
-    assert done.exit_code == 3
-    found = {row["model"]: row for row in answer["comparison"]["rows"]}
-    assert set(found) == {"restitution+delay", "law+delay", "viscous+delay"}
-    assert {model for model, row in found.items() if row["valid"]} == {"law+delay", "viscous+delay"}
-    # the resolved contact, whose loss grows with speed and which holds slow tips: restitution alone is far off
-    assert found["restitution+delay"]["largest_distance"] > 10.0 * found["viscous+delay"]["largest_distance"]
-    assert answer["comparison"]["rows"][-1]["model"] == "restitution+delay"
-    # a model has one chi2
-    assert found["restitution+delay"]["chi2"] == answer["chi2"]

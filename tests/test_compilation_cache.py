@@ -1,12 +1,11 @@
 """Compiled programs kept in the user's cache folder: by commands and sessions, only where nobody else can write."""
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 
-from afm_jax.compilation_cache import make_private, processor_key, silence_xla, user_cache_folder
+from afm_jax.compilation_cache import make_private, processor_key
 from tests.fresh_python import outputs, python
 
 START = (
@@ -34,24 +33,6 @@ def test_the_users_own_cache_settings_stand_and_one_that_cannot_be_written_is_ha
     assert not other.exists()
     other.touch()
     assert start(XDG_CACHE_HOME=str(other), HOME=str(other)) == ["True", "None"]
-
-
-@pytest.mark.slow
-def test_a_user_without_a_home_folder_keeps_nothing():
-    # a user whom the system does not list, as in containers; and a HOME that means another folder wherever one is
-    nobody = "from pathlib import Path\ndef home():\n    raise RuntimeError('no home')\nPath.home = home\n"
-    ask = "import afm_jax\nfrom afm_jax.compilation_cache import cache_folder\n"
-    for before, home in ((nobody, None), ("", "relative")):
-        variables = {"HOME": home, "XDG_CACHE_HOME": None, **UNSET}
-        printed, said = outputs(f"{before}{ask}print(cache_folder(), afm_jax.use_cache())", variables)
-        assert printed == "None None"
-        assert "not kept: there is no home folder: set HOME or XDG_CACHE_HOME" in said
-
-
-def test_cache_folder_is_what_the_variable_says_or_in_the_home_folder(monkeypatch):
-    for value, expected in (("/somewhere", "/somewhere/afm-jax"), ("relative", f"{Path.home()}/.cache/afm-jax")):
-        monkeypatch.setenv("XDG_CACHE_HOME", value)
-        assert user_cache_folder() == Path(expected)
 
 
 def test_no_folder_of_somebody_else_or_that_others_may_write_to_is_private(tmp_path: Path, monkeypatch):
@@ -107,16 +88,6 @@ def test_a_python_session_shares_the_cache_of_the_commands_and_xla_is_silent(tmp
     assert (same, said) == ("True False", "")
     assert list(Path(folder).glob("jit_*"))
     assert start(XDG_CACHE_HOME=str(tmp_path))[1] == folder
-
-
-@pytest.mark.parametrize(("before", "after"), [(None, "3"), ("1", "3"), ("0", "0"), ("2", "2")])
-def test_messages_of_xla_are_what_the_user_asked_for(monkeypatch: pytest.MonkeyPatch, before: str | None, after: str):
-    # 1 is what JAX sets where nobody has asked for anything
-    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
-    if before is not None:
-        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", before)
-    silence_xla()
-    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after
 
 
 def test_doctor_says_whether_the_cache_works(tmp_path: Path):

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.continuation import continue_orbits
-from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.reference_driven_contact import DrivenContact, follow
 
 pytestmark = pytest.mark.slow
@@ -63,17 +62,6 @@ def test_a_stable_orbit_and_a_saddle_near_capture_close_in_the_reference(found):
         later = next_departure(time, float(velocity))
         assert later[0] - time == pytest.approx(PERIOD_US, abs=1e-7)
         assert later[1] == pytest.approx(float(velocity), rel=1e-7)
-
-
-@pytest.mark.long
-def test_a_chart_of_contacts_is_the_orbits_one_by_one(scene, found):
-    plane = scene_family(scene, "platform.amplitude_nm", "platform.offset_nm")
-    chart = stability_chart(plane, x_values=np.array([0.5, AMPLITUDE_NM]), y_values=np.array([0.0]), last_order=1)
-    assert chart.verdicts.stable.tolist() == [[False, True]]
-    assert chart.verdicts.admissible.tolist() == [[False, True]]
-    # chart and orbit are of different accuracy
-    assert chart.verdicts.peak_amplitude_nm[0, 1] == pytest.approx(found.reading.peak_amplitude_nm[0], rel=1e-4)
-    assert chart.verdicts.largest_multiplier[0, 1] == pytest.approx(np.abs(found.multipliers[0, 0]), rel=1e-3)
 
 
 def test_the_multipliers_are_those_of_differences_in_the_reference(found):

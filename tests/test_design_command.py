@@ -1,16 +1,10 @@
 """`afm-jax design`: what it prints, writes and returns."""
 
-import json
-
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from afm_jax.saved import as_json
-from fitting import fit, read_table
 from tests.answers import answer as answer_of
-from tests.fit_tables import EXAMPLE, rows
 from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
@@ -42,25 +36,6 @@ def test_json_holds_points_and_what_they_promise(reported):
         assert answer["points"][-1]["standard_errors"][name] == answer["expected"][name]["standard_error"]
     assert answer["measured_so_far"]["quality_factor"]["standard_error"] == pytest.approx(0.4)
     assert any("epsilon" in warning and "taken from the paper" in warning for warning in answer["warnings"])
-
-
-def test_what_was_measured_is_not_planned_again(tmp_path):
-    table = rows(read_table(EXAMPLE), slice(0, 20))
-    path = tmp_path / "fit.json"
-    path.write_text(json.dumps(as_json(fit(table, "law"))), encoding="utf-8")
-    columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
-    frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
-    heights = f"{offset},{offset + 0.125}"
-    order = int(table.order[0])
-    detuning = frequency / (2 * order * table.free_frequency_khz)
-    grid = ("--orders", order, "--detuning", detuning, "--drive-nm", drive, "--offsets-nm", heights)
-    found = run("--fit", path, *grid, "--points", 1, "--json")
-    assert found.exit_code == 0, found.stderr
-    answer = strictly(found.stdout)
-    assert answer["prior"]["rows_measured"] == 20
-    # what is in the table already is not planned again
-    assert answer["left_out"]["measured"] == 1
-    assert [point["offset_nm"] for point in answer["points"]] == [offset + 0.125]
 
 
 def test_nothing_to_measure_is_not_valid():

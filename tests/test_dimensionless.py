@@ -8,7 +8,6 @@ import pytest
 
 from afm_jax import (
     ParameterRange,
-    bifurcation_diagram,
     continue_orbits,
     dimensionless_scene,
     load_scene,
@@ -29,19 +28,6 @@ def stable_speed(orbits: SingleImpactOrbits) -> float:
 def test_impact_speeds_are_those_of_coco(force: float):
     scene = dimensionless_scene(1.0, 0.05, 0.8, gap=1.0, force=force)
     assert stable_speed(single_impact_orbits(scene, 1)) == pytest.approx(COCO[force], abs=2e-12)
-
-
-@pytest.mark.slow
-def test_a_diagram_draws_the_impact_speeds_of_coco():
-    scene = dimensionless_scene(1.0, 0.05, 0.8, gap=1.0, force=0.5)
-    diagram = bifurcation_diagram(scene, "force.amplitude_nn", np.array(sorted(COCO)), impacts=600)
-    assert diagram.verdicts.names() == ["(1,1)"] * len(COCO)
-    (ramp,) = diagram.plot(ordinate="impact_speed").axes[0].lines
-    np.testing.assert_allclose(np.asarray(ramp.get_xdata()), sorted(COCO))
-    speeds = [COCO[force] for force in sorted(COCO)]
-    np.testing.assert_allclose(np.asarray(ramp.get_ydata()), speeds, rtol=0, atol=1e-9)
-    with pytest.raises(ValueError, match="`ordinate` must be one of height, phase, impact_speed"):
-        diagram.plot(ordinate="speed")
 
 
 def test_the_page_shows_the_same_oscillator(tmp_path):

@@ -15,7 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -103,18 +104,26 @@ def python_rows(trees: Mapping[str, Path], options: argparse.Namespace) -> Itera
         for name in names:
             say(name)
             first = {label: _ask(worker, "prepare", name) for label, worker in workers.items()}
-            runs: dict[str, list[float]] = {label: [] for label in workers if "missing" not in first[label]}
-            for _ in range(options.repeats):
-                for label, each in runs.items():
-                    each.append(_ask(workers[label], "run", name)["seconds"])
+            runs = {
+                label: partial(_ask, workers[label], "run", name)
+                for label, answer in first.items()
+                if "missing" not in answer
+            }
             for label in workers.keys() - runs.keys():
                 say(f"left out of {label}: {first[label]['missing']}")
-            scale = {label: 1e6 / first[label]["events"] for label in runs}
-            medians = {label: scale[label] * statistics.median(each) for label, each in runs.items()}
-            unit = "s" if name.startswith("one tip") else "µs"
-            if unit == "s":
-                medians = {label: 1e-6 * each for label, each in medians.items()}
+            unit, scale = ("s", 1.0) if name.startswith("one tip") else ("µs", 1e6)
+            told = alternated(runs, options.repeats)
+            medians = {label: scale * seconds / first[label]["events"] for label, seconds in told.items()}
             yield {"what": name, "unit": unit, "first": first.get("here", {}).get("seconds"), **medians}
+
+
+def alternated(runs: Mapping[str, Callable[[], Row]], repeats: int) -> dict[str, float]:
+    """Return the median seconds of each run; what else the machine does meets all alike."""
+    seconds: dict[str, list[float]] = {label: [] for label in runs}
+    for _ in range(repeats):
+        for label, run in runs.items():
+            seconds[label].append(run()["seconds"])
+    return {label: statistics.median(each) for label, each in seconds.items()}
 
 
 @contextlib.contextmanager
@@ -159,39 +168,31 @@ def command_rows(trees: Mapping[str, Path], options: argparse.Namespace) -> Iter
             continue
         say(name)
         with tempfile.TemporaryDirectory() as folder:
-            caches = {label: Path(folder) / label for label in trees}
-            first = {label: _command_seconds(command, trees[label], cache) for label, cache in caches.items()}
-            runs: dict[str, list[float]] = {label: [] for label, seconds in first.items() if seconds is not None}
-            for _ in range(min(options.repeats, 3)):
-                for label, each in runs.items():
-                    each.append(_command_seconds(command, trees[label], caches[label]) or float("nan"))
-        yield {
-            "what": f"`afm-jax {command[0]}`: {name.partition(', ')[2]}",
-            "unit": "s",
-            "first": first["here"],
-            **{label: statistics.median(each) for label, each in runs.items()},
-        }
+            calls = {label: partial(_command, command, tree, Path(folder) / label) for label, tree in trees.items()}
+            first = {label: call()["seconds"] for label, call in calls.items()}
+            there = {label: call for label, call in calls.items() if first[label] is not None}
+            medians = alternated(there, min(options.repeats, 3))
+        what = f"`afm-jax {command[0]}`: {name.partition(', ')[2]}"
+        yield {"what": what, "unit": "s", "first": first["here"], **medians}
 
 
-def _command_seconds(command: Sequence[str], tree: Path, cache: Path) -> float | None:
+def _command(command: Sequence[str], tree: Path, cache: Path) -> Row:
     """Return the seconds of a command of a tree; None where it refuses the call."""
     cache.mkdir(exist_ok=True)
-    environment = _environment(tree) | {"XDG_CACHE_HOME": str(cache)}
     began = time.perf_counter()
     # from a folder without sources, which Python would take first
     done = subprocess.run(
         [sys.executable, "-m", "afm_jax", *command, "--json"],
-        env=environment,
+        env=_environment(tree) | {"XDG_CACHE_HOME": str(cache)},
         cwd=cache,
         capture_output=True,
         text=True,
         check=False,
     )
     seconds = time.perf_counter() - began
-    if done.returncode in {0, 3}:
-        return seconds
-    say(f"left out of {tree.name}: {done.stderr.strip().splitlines()[-1:]}")
-    return None
+    if done.returncode not in {0, 3}:
+        say(f"left out of {tree.name}: {done.stderr.strip().splitlines()[-1:]}")
+    return {"seconds": seconds if done.returncode in {0, 3} else None}
 
 
 def rows_of_scipy(options: argparse.Namespace) -> Iterator[Row]:

@@ -6,7 +6,7 @@ import numpy as np
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
-from tests import brute_force, reference_map
+from tests import brute_force, reference_flight, reference_map
 from tests.package_scenes import scene_of
 from tests.reference_flight import Parameters
 
@@ -58,7 +58,7 @@ def compare(p: Parameters, time_us: float, velocity: float, *, periods: float = 
     assert int(mine.outcome) == Outcome.IMPACT
     fastest = max(drive, free)
     # a change of the approach speed near capture is a larger one of the rebound speed
-    gain = max(1.0, float(reference_map.outgoing_slope(reference_map.constants(p), approach)))
+    gain = max(1.0, float(reference_flight.rebound_slope(p, approach)))
     allowed = gain * size * fastest * (fastest * late + 64 * EPS)
     assert abs(float(mine.velocity_after_nm_per_us) - float(exact.velocity_after_nm_per_us)) <= allowed
     scale = np.array([1.0 / drive, p.amplitude_nm * drive])

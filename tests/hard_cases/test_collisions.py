@@ -69,17 +69,6 @@ def test_very_fast_and_very_slow_tips(changes):
         assert np.isfinite(np.asarray(part)).all()
 
 
-@pytest.mark.slow
-def test_zero_viscosity_is_no_viscosity():
-    speeds = [11.0, 15.0, 100.0]
-    zero = collide_in_eights(Contact.paper(viscosity_pa_s=0.0), speeds)
-    absent = collide_in_eights(Contact.paper(effects=("capillary", "structural", "core", "jkr")), speeds)
-    # a quadrature against Runge-Kutta steps: each within its accuracy
-    np.testing.assert_allclose(zero.rebound_speed_nm_per_us, absent.rebound_speed_nm_per_us, rtol=1e-12)
-    np.testing.assert_allclose(zero.collision_delay_us, absent.collision_delay_us, rtol=0, atol=1e-7)
-    assert np.max(np.abs(zero.viscous_loss_aj)) == 0.0
-
-
 def test_syrup_captures_every_tip_of_an_afm():
     result = collide_in_eights(Contact.paper(viscosity_pa_s=1.005), [1.0, 12.0, 60.0, 200.0, 260.0])
     # mpmath: capture speed 271.337 nm/us (test_collide.py)

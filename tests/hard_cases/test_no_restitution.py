@@ -15,8 +15,6 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.apparatus.surface import free_frame
-from afm_jax.dynamics.charts import highest_orbits
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.map import iterate_map, next_impact
@@ -88,16 +86,3 @@ def test_the_map_ends_and_orbits_are_none():
     ends = [float(after(0.0, 4.0 + sign * step)[0]) for sign in (1.0, -1.0)]
     assert float(slopes[0]) == 0.0
     assert float(slopes[1]) == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-7)
-
-
-@pytest.mark.slow
-def test_one_such_lane_of_a_chart_leaves_the_others_alone():
-    def chart(*r):
-        scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(jnp.asarray(r)))
-        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, len(r)), scene)
-        return highest_orbits(scenes, jax.vmap(free_frame)(scenes), jnp.array([1.0]))
-
-    mixed, clean = chart(0.9, 0.0), chart(0.9, 0.8)
-    for name, values in mixed.items():
-        assert values[0].tolist() == clean[name][0].tolist()
-    assert mixed["admissible_orbits"][1].tolist() == [0]

@@ -21,7 +21,8 @@ from tests.collisions_of_eight import collide_in_eights
 
 pytestmark = pytest.mark.slow
 
-BREAKS_NM = 0.504203  # about where the junction of the paper's contact breaks; below, to all digits
+# about where the junction of the paper's contact breaks; below, to all digits
+BREAKS_NM = 0.504203
 
 
 def compare(changes: dict[str, Any], speed: float) -> None:
