@@ -60,7 +60,8 @@ class Result:
             path: of the file; None: none is written.
             options: of the picture, such as `ordinate` of a bifurcation diagram.
         """
-        figure, style = self._drawn(self._picture, **options), importlib.import_module("afm_jax.plots.picture_style")
+        figure = self._drawn(self._picture, **options)
+        style = importlib.import_module("afm_jax.plots.picture_style")
         # a figure without pyplot is shown by a notebook only if it says how
         figure._repr_png_ = lambda: style.png_of(figure)
         if path is not None:

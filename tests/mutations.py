@@ -126,7 +126,7 @@ _EDITS = {
         "dissipation left out of the time": "at.available_aj{ - spent_and_time[0] => })",
         "energy lost where it is gained": "- self.end_potential_aj {- => +} spent",
         "time in the junction counted once": "{2.0 *  => }inside + rests",
-        "delay counted from where the bridge forms": "/ speed + {end.gap_nm => contact.bridge_forms_nm} / jnp.where(",
+        "delay counted from where the bridge forms": "/ speed + {ends_nm => contact.bridge_forms_nm} / jnp.where(",
         "bridge that breaks where it formed": "jnp.maximum(self.{breaks_nm => forms_nm}, self.junction",
     },
     "test_collide.py::test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]": {

@@ -26,6 +26,7 @@ from afm_jax import (
     save_scene,
 )
 from afm_jax.cli.main import main
+from afm_jax.dynamics import impact_orbits
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
 from afm_jax.saved import as_json
@@ -312,3 +313,30 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
     assert "capture" not in ends
     assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)
+
+
+@pytest.fixture
+def feeding(monkeypatch: pytest.MonkeyPatch):
+    """Let every impact feed the motion by a hundredth more than it does: no law of the package does.
+
+    The test with it is the last of the file: what JAX has compiled for the others is forgotten before and after.
+    """
+    true = impact_orbits.trace_and_determinant_of
+
+    def more(*arguments):
+        trace, determinant = true(*arguments)
+        return trace, 1.02 * determinant
+
+    monkeypatch.setattr(impact_orbits, "trace_and_determinant_of", more)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("feeding")
+def test_multipliers_cross_the_circle_at_a_torus_point():
+    given = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), ImpactLaw(0.985))
+    # undamped, without adhesion D = r^2
+    found = continue_orbits(given, 1, ParameterRange("interaction.r", 0.98, 0.995))
+    assert only(found, "torus") == pytest.approx([1.0 / np.sqrt(1.02)], abs=1e-8)

@@ -245,7 +245,9 @@ def detected(
         Amplitude in nm, and by how much it lags behind force or base, in degrees from 0 to 360; arrays of any shape.
     """
     real, imaginary = force_per_height(frequency_ratio, quality_factor)
-    moved, free, turn = as_argument(amplitude_nm), as_argument(free_amplitude_nm), jnp.deg2rad(as_argument(phase_deg))
+    moved = as_argument(amplitude_nm)
+    free = as_argument(free_amplitude_nm)
+    turn = jnp.deg2rad(as_argument(phase_deg))
     along, across = moved * jnp.cos(turn) - free, moved * jnp.sin(turn)
     if base:
         along, across = along + real * free, across + imaginary * free

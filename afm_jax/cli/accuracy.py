@@ -43,7 +43,8 @@ def accuracy(
         load_named(study)
     with session.working("measuring"):
         result = timing.run_in_own_process(measured, problem=study, contacts=contacts, quick=quick)
-    rows, title = result["rows"], f"Error of the {result['value_of']} and of its gradient against time"
+    rows = result["rows"]
+    title = f"Error of the {result['value_of']} and of its gradient against time"
     reference = (
         f"Reference: {result['reference']}, itself known to {result['reference_error']:.0e} (gradient: "
         f"{result['reference_gradient_error']:.0e}). Times are those of one impact or contact on one core, programs "

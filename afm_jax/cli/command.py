@@ -260,7 +260,8 @@ def hand_out(session: Session, output: Output) -> None:
 def _with_scene(output: Output, options: Mapping[str, Any]) -> Output:
     """Return a result that names its scene, and where its law is extrapolated."""
     scene = options["scene"]
-    tables, text = later("afm_jax.scenefile.scenefile:scene_tables")(scene.scene), list(output.text)
+    tables = later("afm_jax.scenefile.scenefile:scene_tables")(scene.scene)
+    text = list(output.text)
     payload = {**output.payload, "scene": tables}
     if scene.unknowns is not None and "draws" in options:
         payload["draws"] = options["draws"]

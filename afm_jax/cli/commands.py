@@ -41,7 +41,9 @@ _MEASURE = "Measure: read data, fit and plan"
 _SIMULATE = "Simulate: motions, orbits, basins of a scene"
 _CONTACT = "Contact: forces between tip and sample"
 _CHECK = "Check: equations, accuracy, speed, installation"
-_LEVER, _READING, _IMAGING = ".read:LeverOptions", ".read:ReadingOptions", ".tapping_map:ImagingOptions"
+_LEVER = ".read:LeverOptions"
+_READING = ".read:ReadingOptions"
+_IMAGING = ".tapping_map:ImagingOptions"
 
 ROWS = (
     Command("calibrate", _MEASURE, ".calibrate:calibration", (".calibrate:CalibrationOptions",), computes=False),

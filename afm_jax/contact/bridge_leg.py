@@ -158,7 +158,8 @@ class Way(NamedTuple):
         drive, lost = self.tip.drive, at.drag * speed
         if drive is None:
             return lost
-        friction, push = 2.0 * drive.cantilever.decay_rate, drive.push.position(self.begin_us + lasted_us)
+        friction = 2.0 * drive.cantilever.decay_rate
+        push = drive.push.position(self.begin_us + lasted_us)
         return lost + self.tip.mass_ng * at.path_nm * (friction * speed + self.sense * push)
 
     def end(

@@ -180,7 +180,8 @@ def collision(
     # kinetic, signed: positive where the tip leaves
     end_aj = jnp.where(lacking > 0.0, retract.energy_aj, lacking)
     lasts_us, in_junction_us = approach.time_us + solid.time_us + retract.time_us, solid.time_us
-    dissipated_aj, junction_aj = approach.dissipated_aj + retract.dissipated_aj, junction.junction_hysteresis_aj
+    dissipated_aj = approach.dissipated_aj + retract.dissipated_aj
+    junction_aj = junction.junction_hysteresis_aj
     ends_nm, deepest_nm, leaves_as = tip.ends_nm, solid.deepest_gap_nm, CollisionOutcome.REBOUND
     stays_as = jnp.where(sticks, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE)
     settled = jnp.ones_like(valid)

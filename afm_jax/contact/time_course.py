@@ -132,7 +132,8 @@ def _joined(
     contact: Contact, junction: Junction, speed: float, legs: list[Stretch], energies: Float[np.ndarray, "3"]
 ) -> TimeCourse:
     """Return the legs one after the other, with free flight before and, for a tip that leaves, after them."""
-    forms, breaks = float(contact.bridge_forms_nm), max(float(contact.bridge_breaks_nm), float(junction.breaks_gap_nm))
+    forms = float(contact.bridge_forms_nm)
+    breaks = max(float(contact.bridge_breaks_nm), float(junction.breaks_gap_nm))
     if not energies[0] > 0.0:
         raise ValueError("the bridge turns the tip round before the junction forms; take a higher speed")
     flight = _FLIGHT * breaks

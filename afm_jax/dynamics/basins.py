@@ -261,7 +261,8 @@ class _Finder:
             # of an orbit its points, each once
             last = slice(-m, None) if m else slice(0)
             phase = within_turn(self.omega * record.departure_us[lane, last], 2.0 * np.pi)
-            velocity, approach = record.velocity_after_nm_per_us[lane, last], record.approach_nm_per_us[lane, -m:]
+            velocity = record.velocity_after_nm_per_us[lane, last]
+            approach = record.approach_nm_per_us[lane, -m:]
             motion = Attractor(names[lane], *kind, phase, velocity, approach[np.isfinite(approach)])
             label[lane] = self.number_of(motion)
         return label

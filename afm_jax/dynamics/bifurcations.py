@@ -226,7 +226,8 @@ def bifurcation_diagram(  # noqa: PLR0913
         return np.where(shown, part, np.nan)
 
     # in the lab the platform is another one than the frame's
-    amplitude, offset = np.asarray(platform.amplitude_nm)[:, None], np.asarray(platform.offset_nm)[:, None]
+    amplitude = np.asarray(platform.amplitude_nm)[:, None]
+    offset = np.asarray(platform.offset_nm)[:, None]
     ahead = np.asarray(seen.frame.phase_rad)[:, None]
     omega = np.asarray(seen.scenes.platform.angular_frequency)[:, None]
     return BifurcationDiagram(

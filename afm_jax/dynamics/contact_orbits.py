@@ -119,7 +119,9 @@ class FlownLoop(NamedTuple):
 
         That one is infinite where no flight has a lowest point.
         """
-        scene, begin_us, rebound = self.scene, jnp.asarray(self.departure_us), jnp.split(self.loop, 2)[1]
+        scene = self.scene
+        begin_us = jnp.asarray(self.departure_us)
+        rebound = jnp.split(self.loop, 2)[1]
         surface, response = surface_of(scene)
         level, rate = surface.position_and_velocity(begin_us)
         lasts = self.contacts.arrival_time_us - begin_us
@@ -366,7 +368,8 @@ class ContactLoops(LoopFamily):
             return None
         here = flown[0]
         units = self.units(len(here.loop) // 2)
-        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, self.width]) / units[:, None]
+        value = here.gaps / units
+        slopes = here.slopes * np.concatenate([units, self.width]) / units[:, None]
         if self.test is not None:
             tests = np.array([self._tests(loop, grazing=self.test == GRAZING)[self.test] for loop in flown])
             value = np.append(value, tests[0])

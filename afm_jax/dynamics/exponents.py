@@ -155,7 +155,8 @@ def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     words = []
     for lane, name in enumerate(exponents.verdicts.names()):
         kind = exponents.verdicts.kind[lane]
-        larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
+        larger = exponents.exponents_per_impact[lane, 0]
+        error = exponents.exponents_per_impact_error[lane, 0]
         # below it is rounding
         if kind == MotionKind.ORBIT and larger > max(1e-9, error):
             # rounding holds the motion there: no neighbour comes to it
@@ -391,7 +392,8 @@ def _impact_jacobians(
 
 def _growth_of(jacobians: Float[np.ndarray, "lanes steps 2 2"]) -> Float[np.ndarray, "lanes steps"]:
     """Return ln |J q| of every step, q the unit tangent vector that the steps before have turned."""
-    vector, growth = np.broadcast_to([0.8, 0.6], (len(jacobians), 2)), np.zeros(jacobians.shape[:2])
+    vector = np.broadcast_to([0.8, 0.6], (len(jacobians), 2))
+    growth = np.zeros(jacobians.shape[:2])
     for number in range(jacobians.shape[1]):
         image = np.einsum("lij,lj->li", jacobians[:, number], vector)
         length = np.linalg.norm(image, axis=1)

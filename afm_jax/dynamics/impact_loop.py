@@ -279,7 +279,8 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
     """
     trace, determinant = trace_and_determinant_of(unknowns, loop)
     impacts = impacts_at(unknowns, loop)
-    after, before = impacts.velocity, loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
+    after = impacts.velocity
+    before = loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
     if loop.response is not None:
         after = after + loop.response.velocity(impacts.leaving_us)
         before = before + loop.response.velocity(impacts.arrival_us)

@@ -210,7 +210,9 @@ def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
     """
     impacts = impacts_at(unknowns, loop)
     slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
-    leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
+    leaving = impacts.leaving_us[slowest]
+    height = impacts.height[slowest]
+    velocity = impacts.velocity[slowest]
     omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
     return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
 

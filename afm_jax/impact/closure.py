@@ -237,7 +237,8 @@ def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
     square = (law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2) / top_speed**2
     middle, half = law.viscous_loss / (2.0 * law.r**2) / top_speed, 0.5 / law.r
     # Y times u, Y times w and Y itself, in powers of Y.
-    approach, rebound = jnp.array([half, middle, half * square]), jnp.array([0.5, 0.0, -0.5 * square])
+    approach = jnp.array([half, middle, half * square])
+    rebound = jnp.array([0.5, 0.0, -0.5 * square])
     cosine, sine = _instantaneous(approach, rebound, jnp.array([0.0, 1.0, 0.0]), flight, platform)
     quartic = _squared(cosine) + _squared(sine)
     return quartic.at[2].add(-(flight.closing**2))

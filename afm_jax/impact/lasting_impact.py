@@ -190,7 +190,8 @@ def gained_and_longer(
         deeper: fraction by which a bridge lets the tip go deeper; its squared speed grows by twice that.
     """
     # without units: kappa and J of the equations
-    kappa, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
+    kappa = middle.acceleration * tau / approach_speed
+    change = middle.change * tau**2 / approach_speed
     lasts, deep = hertz_under_pull(kappa)
     air = AIR * (1.0 + 2.0 * deeper) * (lasts - 1.2 * jnp.clip(kappa, *PULLS) * deep)
     gained = 2.0 * (deep * change - air * cantilever.decay_rate * tau)

@@ -867,7 +867,9 @@ def _capture_speed(u: Any, w: Any, held: float, numpy: Any) -> Any:
     a, c, b = fitted(columns)
     flat_a, flat_b = fitted(columns[::2])
     curved = (a > 0.0) & (b > -_NOTHING) & (c >= 0.0)
-    a, c, b = numpy.where(curved, a, flat_a), numpy.where(curved, c, 0.0), numpy.where(curved, b, flat_b)
+    a = numpy.where(curved, a, flat_a)
+    c = numpy.where(curved, c, 0.0)
+    b = numpy.where(curved, b, flat_b)
     there = (a > 0.0) & (c * c + 4.0 * a * b > 0.0) & (b > -_NOTHING)
     root = numpy.sqrt(numpy.where(there, c * c + 4.0 * a * numpy.maximum(b, _NOTHING), 1.0))
     found = low * numpy.where(
@@ -952,7 +954,8 @@ def _splines(u: Any, w: Any, late: Any, capture: Any, law: TabulatedLaw, numpy: 
     place, numbers = _place(numpy.sqrt(square), scale), _natural(knots, numpy)
     shapes = [numpy.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place, numpy)]
     # by their values at the knots
-    by_values, values = numpy.concatenate(shapes, axis=1) @ numbers, numpy.stack([loss, left], axis=1)
+    by_values = numpy.concatenate(shapes, axis=1) @ numbers
+    values = numpy.stack([loss, left], axis=1)
     if place.shape == knots.shape:
         found = numbers @ numpy.linalg.solve(by_values, values)
     else:

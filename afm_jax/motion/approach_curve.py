@@ -252,7 +252,8 @@ def _at_height(
     reading = _why_over(run)
     if reading is not None:
         return reading, None
-    verdict, dense = settled(here, run.simulation, tolerance=TOLERANCE), DensePath(here, run.simulation)
+    verdict = settled(here, run.simulation, tolerance=TOLERANCE)
+    dense = DensePath(here, run.simulation)
     seen = observe(here, run.simulation, verdict=verdict, dense=dense)
     top = _top_of_swing(dense, seen.window.from_us, seen.window.to_us, period_us)
     return _reading_of(seen, deflection=scene.base is not None), top

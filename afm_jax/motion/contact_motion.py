@@ -207,11 +207,14 @@ def _round(driven: Driven, until_us: Array, setting: DrivenSetting, reverse: boo
     (tip, arrival, repeats), active = course.tip, ~course.done
     free = (tip.phase == ContactPhase.DRY) & active
     flown, arrives, lost = _fly(driven, tip.state, free, until_us)
-    tip, arrival = where(free, TipInContact.arriving(driven, flown, arrives), tip), where(arrives, flown, arrival)
+    tip = where(free, TipInContact.arriving(driven, flown, arrives), tip)
+    arrival = where(arrives, flown, arrival)
     tip = _through_legs(driven, tip, arrives, active & (repeats.times == 0), until_us, setting)
     tip = _step_in_time(driven, tip, active, repeats.times, until_us, setting, reverse=reverse)
 
-    in_contact, leaves, over = active & (arrives | ~free), tip.phase == ContactPhase.DRY, tip.state.time_us >= until_us
+    in_contact = active & (arrives | ~free)
+    leaves = tip.phase == ContactPhase.DRY
+    over = tip.state.time_us >= until_us
     again, repeats = _repetition(tip, arrival, repeats, in_contact & leaves & ~over, setting)
     ends, finite = in_contact & (leaves | over) & ~again, jnp.isfinite(tip.state.x)
     outcome = jnp.where(ends & ~leaves, MotionOutcome.HELD, MotionOutcome.FINISHED)

@@ -113,7 +113,8 @@ def follow_law(  # noqa: PLR0913
     search = Search(_FLIGHT_STEPS, jnp.asarray(tolerance, until.dtype), until, from_above=True)
     course = follow_rounds(partial(_one_flight, seen, until, search), course, rounds=max_contacts + 1, reverse=reverse)
     row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
-    arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
+    arrival = State(row.arrival_us, no_gap, -row.approach)
+    departure = State(row.departure_us, no_gap, row.rebound)
     lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
     held = course.outcome == MotionOutcome.HELD
     return Simulation(
@@ -234,7 +235,9 @@ class Bed(NamedTuple):
 
     def time_pressed(self, time_us: Float[Array, ""]) -> Float[Array, ""]:
         """Return infinity where the push stays positive after a time in us, whatever the phase of the waves, else 0."""
-        surface, decay, square = self.surface, self.cantilever.decay_rate, self.cantilever.angular_frequency**2
+        surface = self.surface
+        decay = self.cantilever.decay_rate
+        square = self.cantilever.angular_frequency**2
         rate, reach = surface.offset_rate_nm_per_us, surface.reach_nm
         waves = surface.largest_acceleration_nm_per_us2 + (
             2.0 * decay * surface.fastest_angular_frequency * reach + square * reach

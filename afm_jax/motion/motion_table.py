@@ -88,12 +88,15 @@ def _(result: MotionTable) -> dict[str, Any]:
 @sections.register
 def _(result: MotionTable) -> list[Section]:
     simulation, seen, verdict, window = result.run.simulation, result.seen, result.run.verdict, result.seen.window
-    begin, final, phase = simulation.start, simulation.final, ContactPhase(int(simulation.phase)).name.lower()
+    begin = simulation.start
+    final = simulation.final
+    phase = ContactPhase(int(simulation.phase)).name.lower()
     times, mean = f"{float(begin.time_us):.6g} to {float(final.time_us):.6g}", ""
     reading = ["Less than a response period: no means, energies, amplitudes and phases; follow the motion longer."]
     if window.responses:
         mean, reading = f"mean height {seen.mean_height_nm:.6g} nm, ", _over_a_response(seen)
-    position, velocity = f"{float(final.position_nm):.6g} nm", f"{float(final.velocity_nm_per_us):.6g} nm/us"
+    position = f"{float(final.position_nm):.6g} nm"
+    velocity = f"{float(final.velocity_nm_per_us):.6g} nm/us"
     read = f"{window.from_us:.6g} to {window.to_us:.6g}"
     parts = [
         f"{'Settled' if verdict.settled else 'Not settled'}: {verdict.reason}.",

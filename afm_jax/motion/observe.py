@@ -359,7 +359,8 @@ class MotionWindow:
         """1/T int F z dt in aJ; an impact of a law counts m (V' - V) z, z halfway where it has a delay."""
         if self.scene.interaction is None or self._resolved:
             return self.integral(self.path.force_nn * self.path.position_nm) / self.span_us
-        rows, impacts = self.dense.contacts, self.begun & (self.dense.contacts.kind == ContactKind.IMPACT)
+        rows = self.dense.contacts
+        impacts = self.begun & (self.dense.contacts.kind == ContactKind.IMPACT)
         kick = (rows.departure_velocity_nm_per_us - rows.arrival_velocity_nm_per_us)[impacts]
         height = 0.5 * (rows.departure_position_nm + rows.arrival_position_nm)[impacts]
         return float(self.scene.cantilever.mass_ng) * float(np.sum(kick * height)) / self.span_us

@@ -153,7 +153,8 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
         where = "the tip no longer meets the sample" if scene.interaction is not None else "the cantilever is free"
         return Settled(f"{where}, and its transient has decayed", contacts=0, periods=1, remaining=transient)
     rows = contacts_left(simulation)
-    turns, velocities = rows.departure_time_us[None] / drive.period_us, rows.departure_velocity_nm_per_us[None]
+    turns = rows.departure_time_us[None] / drive.period_us
+    velocities = rows.departure_velocity_nm_per_us[None]
     found = find_repetitions(turns, velocities, tolerance=tolerance)
     contacts, periods, remaining = (column[0].item() for column in found)
     if not contacts:

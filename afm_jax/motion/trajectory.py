@@ -216,7 +216,8 @@ def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Tra
 
 def flights_of(scene: Scene, simulation: Simulation) -> Pieces:
     """Return all flights of a simulation of one scene."""
-    rows, first = contacts_of(simulation), [np.asarray(part, float).reshape(1) for part in simulation.start]
+    rows = contacts_of(simulation)
+    first = [np.asarray(part, float).reshape(1) for part in simulation.start]
     departures = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
     origin, position, velocity = map(np.concatenate, zip(first, departures, strict=True))
     flies = np.isfinite(origin)

@@ -258,7 +258,8 @@ def basins_figure(basins: Basins) -> Figure:
         for index, (attractor, share) in enumerate(zip(basins.attractors[:number], basins.share, strict=False))
     ]
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
-    top, style = edges[1][-1], {"color": "white", "markeredgecolor": "black", "ms": 11.0, "zorder": 5}
+    top = edges[1][-1]
+    style = {"color": "white", "markeredgecolor": "black", "ms": 11.0, "zorder": 5}
     for attractor in basins.attractors[:number]:
         for phase, speed in zip(np.degrees(attractor.phase_rad), attractor.rebound_speed_nm_per_us, strict=True):
             axes.plot(phase, min(speed, top), "o" if speed <= top else "^", clip_on=False, **style)

@@ -229,7 +229,8 @@ def course_figure(look: Look) -> Figure:
 
 def _around(look: Look, row: int) -> tuple[float, float]:
     """Return the times between which a contact is shown: from and to a gap of a few nm."""
-    arrival, departure = look.dense.contacts.arrival_time_us[row], look.dense.contacts.departure_time_us[row]
+    arrival = look.dense.contacts.arrival_time_us[row]
+    departure = look.dense.contacts.departure_time_us[row]
     approach = max(float(look.dense.contacts.approach_speed_nm_per_us[row]), 1.0)
     lead = 0.4 * min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
     end = departure if np.isfinite(departure) else arrival + look.drive.period_us
@@ -243,7 +244,8 @@ def force_gap_figure(look: Look) -> Figure:
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
-        lost, over = look.dense.contacts.energy_lost_aj[row], np.isfinite(look.dense.contacts.departure_time_us[row])
+        lost = look.dense.contacts.energy_lost_aj[row]
+        over = np.isfinite(look.dense.contacts.departure_time_us[row])
         label = f"contact {row + 1}: " + (f"{lost:.1f} aJ lost" if over else "not over")
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):
@@ -279,7 +281,8 @@ def section_figure(look: Look) -> Figure:
     label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
     axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
     # what is left of a settled motion is rounding: the axis does not magnify it
-    middle, spread = 0.5 * float(velocity.max() + velocity.min()), 0.5 * float(velocity.max() - velocity.min())
+    middle = 0.5 * float(velocity.max() + velocity.min())
+    spread = 0.5 * float(velocity.max() - velocity.min())
     half = max(1.1 * spread, _LEAST_SHOWN * float(np.abs(velocity).max()))
     axes.set_ylim(middle - half, middle + half)
     axes.legend(loc="best", fontsize=10, framealpha=1.0)

@@ -30,7 +30,9 @@ from afm_jax.whole_files import write_whole
 from afm_jax.words import printable
 
 FORMAT, FORMAT_VERSION = "afm-jax law", 1
-_APPROACH, _REBOUND, _DELAY = "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us"
+_APPROACH = "approach_speed_nm_per_us"
+_REBOUND = "rebound_speed_nm_per_us"
+_DELAY = "collision_delay_us"
 _ERRORS = ("rebound_speed_error_nm_per_us", "collision_delay_error_us")
 _COLUMNS = (_APPROACH, _REBOUND, _ERRORS[0], _DELAY, _ERRORS[1])
 _BESIDES = ("rebound_low", "rebound_high", "delay_low", "delay_high", "captured", "outcome", "time_in_", "deepest_gap_")

@@ -275,7 +275,8 @@ class _Repeated(NamedTuple):
             varied = sorted({*known, *moved})
             given = [tangents[i] if i in known else jnp.zeros_like(primals[i]) for i in varied]
             results = self._with_tangents(len(primals), varied, moved).done(*primals, *given)
-            values, slopes = results[: len(self.changed)], dict(zip(moved, results[len(self.changed) :], strict=True))
+            values = results[: len(self.changed)]
+            slopes = dict(zip(moved, results[len(self.changed) :], strict=True))
             none = [np.zeros(value.shape, jax.dtypes.float0) for value in values]
             return values, tuple(slopes.get(index, zero) for index, zero in zip(self.changed, none, strict=True))
 

@@ -148,7 +148,9 @@ def newton_rows(
         slopes=np.full((count, unknowns, unknowns), np.nan),
         details=[None] * count,
     )
-    step, lowest, halved = np.zeros((count, unknowns)), np.full(count, np.inf), np.zeros(count, int)
+    step = np.zeros((count, unknowns))
+    lowest = np.full(count, np.inf)
+    halved = np.zeros(count, int)
     rows = np.arange(count)
     for _ in range(settings.rounds):
         if not rows.size:

@@ -585,7 +585,9 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
         motion = EquationOfMotion(scene.cantilever, surface, scene.interaction)
         settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
         # the coarsest of them may be as late
-        finest, reference, beyond_us = _FINEST_US, "root tolerance 1e-15 us", 2.0 * _ROOT_TOLERANCES_US[0]
+        finest = _FINEST_US
+        reference = "root tolerance 1e-15 us"
+        beyond_us = 2.0 * _ROOT_TOLERANCES_US[0]
     else:
         driven = driven_by(scene.interaction, scene.cantilever, surface)
         motion = EquationOfMotion(scene.cantilever, surface, None, driven, scene.interaction.spans)

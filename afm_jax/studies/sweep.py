@@ -326,7 +326,8 @@ def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row:
     return {name: found[name][:, 0] for name in _CONTACT_NUMBERS + _CONTACT_TRUTHS} | {MESSAGE: ""}
 
 
-_CONTACT_NUMBERS, _CONTACT_TRUTHS = ("peak_amplitude_nm", "largest_multiplier"), ("stable", "admissible", "unresolved")
+_CONTACT_NUMBERS = ("peak_amplitude_nm", "largest_multiplier")
+_CONTACT_TRUTHS = ("stable", "admissible", "unresolved")
 """Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
 _COLLISION_NUMBERS = (
     "rebound_speed_nm_per_us",
@@ -365,7 +366,8 @@ def _collisions(
             numbers[name] = jnp.where(trusted & ~stays, getattr(found, name), jnp.nan)
         return numbers | {"captured": found.captured, "outcome": found.outcome}
 
-    shown, words = ("rebound_speed_nm_per_us", "collision_delay_us"), {"outcome": _codes(CollisionOutcome)}
+    shown = ("rebound_speed_nm_per_us", "collision_delay_us")
+    words = {"outcome": _codes(CollisionOutcome)}
     return Recorder(_in_batches(record), 16384, shown, words=words)
 
 

@@ -203,9 +203,12 @@ def _check_sweep(sweep: Resonance) -> None:
 
 def _fitted(sweep: Resonance) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, with what makes it invalid and its warnings."""
-    largest, averages = float(sweep.amplitude.max()), sweep.averages if sweep.spectrum else None
+    largest = float(sweep.amplitude.max())
+    averages = sweep.averages if sweep.spectrum else None
     # without errors they are what makes chi2/dof 1
-    error, size, origin = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01), 1.0, "estimated"
+    error = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01)
+    size = 1.0
+    origin = "estimated"
     if averages is not None:
         # the mean of a term of the gamma deviance is a little above 1
         size, origin = 2.0 * averages * (np.log(averages) - digamma(averages)), "averages"
@@ -336,7 +339,9 @@ def _springs(
     if None in (error for _, error in read):
         return {}
     springs, mean = {}, found.mean_square_nm2
-    who, wanted, share = "the instrument", found.sweep.instrument.get("spring_constant_n_per_m"), 0.1
+    who = "the instrument"
+    wanted = found.sweep.instrument.get("spring_constant_n_per_m")
+    share = 0.1
     if "length_um" in known:
         centre, errors = np.array([*read, *known.values()]).T
         who, wanted = "Sader's method", sader(*centre)

@@ -145,7 +145,8 @@ def minimum(sweep: Resonance, error: Points) -> tuple[Lowest, Response, bool]:
 
 def chi2_without_resonance(sweep: Resonance, error: Points) -> float:
     """Return chi2 of a parabola through amplitude or response, which has no resonance; arguments as of `minimum`."""
-    columns, measured = np.vander(sweep.position, 3).astype(complex), measured_response(sweep)
+    columns = np.vander(sweep.position, 3).astype(complex)
+    measured = measured_response(sweep)
     # the root of a density has half its relative error
     noise = 0.5 * error * np.abs(measured) if sweep.spectrum else error
     solution = np.linalg.lstsq(columns / noise[:, None], measured / noise, rcond=None)[0]

@@ -261,7 +261,8 @@ def stated_errors(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " point
         ends = float(orbits.approach[chosen].min()), float(orbits.approach[chosen].max())
         law = replace(law, own=(*law.own, "viscous_loss") if drag else law.own).beside(ends, SMOOTH)
     model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.end.theta, orbits))
-    places, theta = [model.names.index(name) for name in prior.problem.names], np.zeros(len(model.names))
+    places = [model.names.index(name) for name in prior.problem.names]
+    theta = np.zeros(len(model.names))
     theta[places], change = rows.end.theta, _by_unknown(rows.model, rows.end.theta)
     of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[chosen].reshape(-1, theta.size)
     of_prior = np.zeros((len(places), theta.size))

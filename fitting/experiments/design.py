@@ -262,11 +262,13 @@ def choose_points(
     strength = np.diag(prior + each.sum(axis=0))
     unit = 1.0 / np.sqrt(np.where(strength > 0.0, strength, 1.0))
     # a little information on every parameter: the first points, which alone determine nothing, can then be compared
-    so_far, gains = unit[:, None] * prior * unit + 1e-9 * np.eye(len(unit)), unit[:, None] * each * unit
+    so_far = unit[:, None] * prior * unit + 1e-9 * np.eye(len(unit))
+    gains = unit[:, None] * each * unit
 
     def score(information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
         """Return log det of the information about what matters: log det F - log det F_nuisances."""
-        whole, nuisances = np.linalg.slogdet(information)[1], information[:, ~matters][:, :, ~matters]
+        whole = np.linalg.slogdet(information)[1]
+        nuisances = information[:, ~matters][:, :, ~matters]
         return whole - np.linalg.slogdet(nuisances)[1]
 
     chosen: list[int] = []

@@ -196,7 +196,8 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         ValueError: if the model or a parameter is none.
     """
     payload = as_json(result) if isinstance(result, FitResult) else result
-    settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
+    settings = payload.get("settings") or {}
+    tables = payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
     label = payload["tables"][0]["name"] if payload.get("tables") else ""

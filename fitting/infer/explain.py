@@ -104,7 +104,8 @@ class Explained:
             begin: from where; None: from the minimum.
         """
         begin = self.end if begin is None else begin
-        theta, covariance = begin.theta.copy(), covariance_of(begin.jacobian.T @ begin.jacobian)
+        theta = begin.theta.copy()
+        covariance = covariance_of(begin.jacobian.T @ begin.jacobian)
         if np.isfinite(covariance).all() and covariance[place, place] > 0.0:
             theta = theta + covariance[place] / covariance[place, place] * (value - theta[place])
         theta[place] = value
@@ -115,7 +116,8 @@ class Explained:
 
         The way there is gone in parts, shorter ones where an orbit is lost; infinite where there is none.
         """
-        fixed, stops = np.zeros(self.end.theta.size, bool), self.stops.setdefault(place, [self.end])
+        fixed = np.zeros(self.end.theta.size, bool)
+        stops = self.stops.setdefault(place, [self.end])
         fixed[place] = True
         begin = min(stops, key=lambda stop: abs(stop.theta[place] - value))
         longest = _PART * float(np.sqrt(self.covariance[place, place]))

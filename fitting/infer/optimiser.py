@@ -50,7 +50,9 @@ def minimised(
     sound = np.isfinite(curvature).all()
     strength, axes = np.linalg.eigh(curvature if sound else np.eye(start.size))
     scale = axes / np.sqrt(np.maximum(strength, 1e-8 * max(float(strength[-1]), 1e-12)))
-    z, value, gradient = np.zeros_like(start), first.value, (first.residual @ first.jacobian) @ scale
+    z = np.zeros_like(start)
+    value = first.value
+    gradient = (first.residual @ first.jacobian) @ scale
     # optax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
         step, state = _update(gradient, _init(z), z)
@@ -62,7 +64,9 @@ def minimised(
             if not there.value <= value + 2.0 * _ARMIJO * share * float(gradient @ move):
                 share *= 0.5
                 continue
-            z, value, gradient = z + share * move, there.value, (there.residual @ there.jacobian) @ scale
+            z = z + share * move
+            value = there.value
+            gradient = (there.residual @ there.jacobian) @ scale
             share = 1.0
             step, state = _update(gradient, state, z)
     return Minimised(start + scale @ z, value, count)

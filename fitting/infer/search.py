@@ -159,7 +159,8 @@ class Followed:
         self, place: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows k"]]:
         """Return d w^2/d u^2 at every row's approach speed, with which the determinant grows, and its derivatives."""
-        theta, speeds = self.model.of_law(place), np.outer([1.0 - _APART, 1.0 + _APART], self.speeds)
+        theta = self.model.of_law(place)
+        speeds = np.outer([1.0 - _APART, 1.0 + _APART], self.speeds)
         # at once: a contact's law takes as long for many speeds as for few
         found, (apart,) = self.model.law.at(theta, speeds.ravel()), np.diff(speeds**2, axis=0)
         slope = np.zeros((apart.size, place.size))
@@ -247,7 +248,9 @@ def _lost_squared(model: Model) -> tuple[float, float] | None:
     if not some.any():
         return None
     ratio = data.row.drive_frequency_khz / data.free_frequency_khz
-    free, amplitude, lag = data.row.drive_amplitude_nm, data.read[:, 1], np.deg2rad(data.read[:, 2])
+    free = data.row.drive_amplitude_nm
+    amplitude = data.read[:, 1]
+    lag = np.deg2rad(data.read[:, 2])
     size = np.hypot(1.0 - ratio**2, ratio / data.quality_factor)
     frequency = RAD_PER_US_PER_KHZ * data.free_frequency_khz
     lost = (
@@ -301,7 +304,8 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
             continue
         weights = plain_weights(small.data, _WIDTH, nothing)
         end = polished_by_optax(small, theta, found.orbits, weights)
-        found, weights = orbits_at(small, end, every), plain_weights(small.data, _FINER, nothing)
+        found = orbits_at(small, end, every)
+        weights = plain_weights(small.data, _FINER, nothing)
         end = descend(small, end, found.orbits, weights, soft=_SOFT, settled=0.1).theta
         here = soft_cost(small.data, orbits_at(small, end, every), every, _FINER)
         if here < least:

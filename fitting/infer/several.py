@@ -44,7 +44,8 @@ class Parts(NamedTuple):
         if table is not None:
             kept[table], there = False, ~self.own[table]
         some = np.ix_(there, there)
-        matrix, vector = self.matrix[kept].sum(axis=0)[some], self.vector[kept].sum(axis=0)[there]
+        matrix = self.matrix[kept].sum(axis=0)[some]
+        vector = self.vector[kept].sum(axis=0)[there]
         change = np.zeros(there.size)
         change[there] = -np.linalg.lstsq(matrix, vector, rcond=None)[0]
         return covariance_of(matrix)[np.ix_(self.law, self.law)], change

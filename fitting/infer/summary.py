@@ -199,7 +199,8 @@ def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
         elif is_of_one_table(name) or (model.law.lasting and (name not in bounded or far)):
             ends = value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error
             if place is not None and not formula and name in model.law.own:
-                here, reach = fitted.explained.end.theta[place], TWO_SIDED_95 * float(np.sqrt(variance))
+                here = fitted.explained.end.theta[place]
+                reach = TWO_SIDED_95 * float(np.sqrt(variance))
                 ends = model.law.value_of(name, here - reach), model.law.value_of(name, here + reach)
             intervals.append(linear_interval(parameter_called(name), *map(float, ends)))
         else:
@@ -231,7 +232,9 @@ def _profile_of(fitted: Fitted, name: str, error: float) -> Interval:
 def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> FittedRows:
     """Return measured and predicted readings."""
     data, orbits, weights = explained.model.data, explained.end.orbits, explained.weights
-    by_law, number, read = explained.by_law_alone(), explained.found.number, readings_of(table)[0]
+    by_law = explained.by_law_alone()
+    number = explained.found.number
+    read = readings_of(table)[0]
     exists, reasons, hits = number > 0, weights.reasons.copy(), ~data.row.free
     reasons[np.isfinite(read).any(axis=1) & ~data.measured.any(axis=1)] = ATTRACTED
     counted = data.measured & (reasons == "")[:, None]

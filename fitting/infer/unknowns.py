@@ -274,7 +274,8 @@ class Model:
 
     def slopes(self, theta: Float[np.ndarray, " k"], orbits: Orbits) -> Float[np.ndarray, "rows 3 k"]:
         """Return the derivatives of the readings by the unknowns: local slopes times what law and instrument change."""
-        known, along = len(self.law.names), np.zeros((len(orbits.x), READINGS, len(self.names)))
+        known = len(self.law.names)
+        along = np.zeros((len(orbits.x), READINGS, len(self.names)))
         speeds = np.where(np.isfinite(orbits.approach) & (orbits.approach > 0.0), orbits.approach, 100.0)
         law, by_local = self.law.at(self.of_law(theta), speeds), orbits.slopes
         along[:, :, :known] = (

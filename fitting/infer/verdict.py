@@ -327,7 +327,8 @@ def _courses(evidence: Evidence) -> str:
             continue
         for name, column in zip(("peak amplitude", "lock-in amplitude", "phase"), residual.T, strict=False):
             seen = column[np.isfinite(column)]
-            course, count = np.linspace(-1.0, 1.0, table.rows)[np.isfinite(column)], max(seen.size, 1)
+            course = np.linspace(-1.0, 1.0, table.rows)[np.isfinite(column)]
+            count = max(seen.size, 1)
             course -= course.sum() / count
             spread = max(1.0, float(np.linalg.norm(seen)) / count**0.5)
             slope = -float(course @ seen) / max(float(np.linalg.norm(course)) * spread, 1e-300)

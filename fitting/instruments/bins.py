@@ -113,7 +113,8 @@ def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
     # a column of one height, or of one number, has no slope
     width = _means(of_row, x * x)
     slope = np.where(width > 0.0, _means(of_row, x * y) / np.where(width > 0.0, width, 1.0), 0.0)
-    squares, freedom = np.bincount(of_row, (y - slope[of_row] * x) ** 2), np.maximum(rows - 2.0, 0.0)
+    squares = np.bincount(of_row, (y - slope[of_row] * x) ** 2)
+    freedom = np.maximum(rows - 2.0, 0.0)
     window = np.ones(2 * _NEIGHBOURS + 1)
     pooled, free = (np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, freedom))
     return np.sqrt(pooled / np.maximum(free, 1.0))[groups]

@@ -248,7 +248,8 @@ def _jump(values: Rows, lag: Rows | None) -> tuple[float, float] | None:
         return None
     sums = np.cumsum(values)
     counts = np.arange(_FEWEST, rows - _FEWEST + 1)
-    before, after = sums[counts - 1] / counts, (sums[-1] - sums[counts - 1]) / (rows - counts)
+    before = sums[counts - 1] / counts
+    after = (sums[-1] - sums[counts - 1]) / (rows - counts)
     most = int(np.argmax(np.abs(after - before)))
     single = float(np.median(np.abs(np.diff(values)))) / 0.954
     error = single * np.sqrt(1.0 / counts[most] + 1.0 / (rows - counts[most]))

@@ -204,7 +204,8 @@ def turns_of(height: Float[np.ndarray, " rows"]) -> list[int]:
     rising, extreme = 0, 0
     low = high = 0
     for row, value in enumerate(height.tolist()):
-        low, high = (row if value < height[low] else low), (row if value > height[high] else high)
+        low = row if value < height[low] else low
+        high = row if value > height[high] else high
         if not rising:
             rising = 1 if value - height[low] > least else -1 if height[high] - value > least else 0
             extreme = row

@@ -357,7 +357,9 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    offset, amplitude, lag = curve.offset_nm, np.asarray(curve.amplitude), curve.phase_lag_deg
+    offset = curve.offset_nm
+    amplitude = np.asarray(curve.amplitude)
+    lag = curve.phase_lag_deg
     looks = {}
     for branch in dict.fromkeys(curve.branch.tolist()):
         here = curve.branch == branch
@@ -454,7 +456,9 @@ def _add_phase(
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
     readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
-    s, quality, either = readings.frequency_ratio[0], readings.quality_factor, np.array([1.0, -1.0])
+    s = readings.frequency_ratio[0]
+    quality = readings.quality_factor
+    either = np.array([1.0, -1.0])
     of_ratio = free_lag_deg(readings.drive, s * (1.0 + readings.frequency_error * either), quality)
     of_quality = free_lag_deg(readings.drive, s, quality * (1.0 + readings.quality_error * either))
     error = float(np.linalg.norm([max(scatter, 0.01), 0.5 * np.ptp(of_ratio), 0.5 * np.ptp(of_quality)]))
@@ -563,7 +567,8 @@ def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
     if curve.phase_lag_deg is not None:
         readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
-    width, single = curve.bin_nm or 0.0, {name: float(one.value) for name, one in known.items()}
+    width = curve.bin_nm or 0.0
+    single = {name: float(one.value) for name, one in known.items()}
     stated = {name for name, one in known.items() if not width or one.origin.startswith("option")}
     rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, single, stated)
     return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))

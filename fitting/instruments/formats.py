@@ -141,7 +141,8 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     if any(map(NUMBER.fullmatch, titles)):
         titles = [str(k + 1) for k in range(len(titles))]
     else:
-        titles, body = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)], body[1:]
+        titles = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)]
+        body = body[1:]
         ways = [WAY.search(title) for title in titles]
         back = ["[bwd] " if way and way[1] == "Rt" else "" for way in ways]
         titles = [mark + WAY.sub("", title) for mark, title in zip(back, titles, strict=True)]

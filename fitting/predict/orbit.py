@@ -327,7 +327,8 @@ def starts_of(
 
 def _in_blocks(program, table: AnyLaw, drive: str, *trees):
     """Return what a program makes of rows, a fixed number at a time."""
-    count, block = len(jax.tree.leaves(trees)[0]), BLOCK if isinstance(table, LawTable) else 4 * BLOCK
+    count = len(jax.tree.leaves(trees)[0])
+    block = BLOCK if isinstance(table, LawTable) else 4 * BLOCK
     parts = []
     for first in range(0, count, block):
         some = np.minimum(np.arange(first, first + block), count - 1)
@@ -363,7 +364,9 @@ def followed(
         judge: say which are steady.
     """
     x, count = x.copy(), len(x)
-    slopes, found, state = np.zeros((count, 7, 3 + COUNT)), np.ones((count, 7)), np.zeros((count, 10))
+    slopes = np.zeros((count, 7, 3 + COUNT))
+    found = np.ones((count, 7))
+    state = np.zeros((count, 10))
     moving, most = np.arange(count), most if isinstance(table, LawTable) else 1
     with np.errstate(all="ignore"):
         for left in reversed(range(most)):
@@ -428,7 +431,8 @@ def _trace_and_determinant(
     map_ = map_ / np.stack([faster, 1.0 / omega], axis=1)[:, None]
     late = amplitude[:, None] * map_[:, 0] / approach[:, None]
     slow = -(amplitude * omega)[:, None] * map_[:, 1] - pull[:, None] * late
-    trace, determinant = late[:, 1] + slow[:, 0], late[:, 1] * slow[:, 0] - slow[:, 1] * late[:, 0]
+    trace = late[:, 1] + slow[:, 0]
+    determinant = late[:, 1] * slow[:, 0] - slow[:, 1] * late[:, 0]
     return 2.0 + trace, 1.0 + trace + determinant
 
 
@@ -436,7 +440,8 @@ def _slope_of_closing(x, gaps, state, local) -> Float[np.ndarray, " rows"]:
     """Return the slope of the closing condition per relative change of the coordinate, as `closure.near_fold`."""
     frequency = RAD_PER_US_PER_KHZ * local[:, 6]
     decay = 0.5 * frequency / local[:, 7]
-    kept, turn = np.exp(-decay * state[:, 2]), np.sqrt(frequency**2 - decay**2) * state[:, 2]
+    kept = np.exp(-decay * state[:, 2])
+    turn = np.sqrt(frequency**2 - decay**2) * state[:, 2]
     return x[:, 0] * np.linalg.det(gaps[:, :2, :2]) / (1.0 - 2.0 * kept * np.cos(turn) + kept**2)
 
 

@@ -100,7 +100,9 @@ def draw_lags(axes: Axes, result: FitResult) -> None:
 def _draw_readings(axes: Axes, result: FitResult, kind: int, measured: np.ndarray, predicted: np.ndarray) -> None:
     """Draw readings of a kind, if there are any, with their prediction."""
     ranking, places = _row_axis(result)
-    aside, measured, predicted = result.rows.set_aside[ranking], measured[ranking], predicted[ranking]
+    aside = result.rows.set_aside[ranking]
+    measured = measured[ranking]
+    predicted = predicted[ranking]
     if not np.isfinite(measured).any():
         return
     fitted = np.where(aside, np.nan, measured)

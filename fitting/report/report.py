@@ -97,7 +97,8 @@ def _(result: Comparison) -> list[Section]:
             cells = [known(row.get("largest_distance"), ".2g"), "-" if share is None else percent(share)]
         chi2 = f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
         rows.append([row["model"], chi2, *cells, "yes" if row["valid"] else "no"])
-    said, head = "Models, best first:", ["model", "chi2/dof", "AIC", "above the best", "valid"]
+    said = "Models, best first:"
+    head = ["model", "chi2/dof", "AIC", "above the best", "valid"]
     if by_distance:
         said = "Formulas and the law that was found without them, the closest first:"
         head[2:4] = ["at most off (band half-widths)", "of u_out"]

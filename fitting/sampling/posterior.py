@@ -209,7 +209,9 @@ def log_density_of(explained: Explained) -> LogDensity:
 
 def _nuts(density: LogDensity, samples: int, seed: int) -> PosteriorChains:
     """Return chains of the no-U-turn sampler, each started from a place of its own about an error away."""
-    blackjax, log_density, size = require_blackjax(), jax.jit(density.__call__), density.middle.size
+    blackjax = require_blackjax()
+    log_density = jax.jit(density.__call__)
+    size = density.middle.size
 
     def chain(key):
         start, warm, draw = jax.random.split(key, 3)

@@ -262,7 +262,8 @@ def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], s
         source.refuse(error & ~value, f"the value has no error; {mend}", lines, column.name)
         source.refuse(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
     amplitudes = [column.name for column in present if column.amplitude]
-    empty, unseen = np.all([blank[name] for name in amplitudes], axis=0), np.zeros(len(lines), bool)
+    empty = np.all([blank[name] for name in amplitudes], axis=0)
+    unseen = np.zeros(len(lines), bool)
     message = f"the row has no amplitude; fill {' or '.join(amplitudes)} in or remove the row"
     if "no_orbit" in columns:
         unseen = columns["no_orbit"] == 1.0

@@ -178,7 +178,9 @@ def phase_readings(curve: TappingCurve, free: Mask, ways: Sequence[np.ndarray] =
         free: rows of the free tip.
         ways: rows of each drive and way, the farthest first; empty where heights are not known.
     """
-    frequency, quality, level = curve.free_frequency_khz, curve.quality_factor, curve.free_amplitude_nm
+    frequency = curve.free_frequency_khz
+    quality = curve.quality_factor
+    level = curve.free_amplitude_nm
     return PhaseReadings(
         drive=curve.drive,
         frequency_ratio=curve.drive_frequency_khz / frequency.value,

@@ -264,7 +264,8 @@ class Lever:
 
     def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
         """Return the instrument of a curve, at the minimum if no unknowns are given."""
-        values, rows = self.values(self.minimum.at if x is None else x), self.curves[number].rows
+        values = self.values(self.minimum.at if x is None else x)
+        rows = self.curves[number].rows
         zero, factor = np.zeros(rows), np.zeros(rows)
         for unknown, value in zip(self.unknowns, values.tolist(), strict=True):
             if unknown.curve == number:
@@ -349,7 +350,9 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
     found = []
     for kind in range(kinds.max(initial=-1) + 1):
         here = kinds == kind
-        rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
+        rows = np.flatnonzero(here & free & np.isfinite(off))
+        start = zero
+        error = _ANY_ZERO_DEG
         if len(rows):
             first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
             start = float(first + np.average(turned(off[rows] - first), weights=weights))
@@ -676,7 +679,8 @@ def energies_along(
     low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
     middle = 0.5 * (low + high)
     common = TWO_SIDED_95 * lever.curves[0].relative_error * middle
-    low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
+    low = np.maximum(middle - np.hypot(middle - low, common), 0.0)
+    high = middle + np.hypot(high - middle, common)
     bands = zip(curves, low.reshape(-1, _POINTS), high.reshape(-1, _POINTS), strict=True)
     curves = iter([replace(curve, energy_low_aj=below, energy_high_aj=above) for curve, below, above in bands])
     return [
@@ -758,10 +762,13 @@ def _stretch(curve: TappingCurve, rows: np.ndarray, place: Rows, values: Rows, s
     """
     amplitude_slope, lag_slope = (slope[rows] for slope in slopes)
     free, ratios = curve.free_amplitude_nm[rows], 1.0 + _SHALLOW - np.exp(place[rows])
-    by_lag, steep, kept = lag_slope * curve.lag_error_deg[rows], np.zeros(len(rows)), np.ones(len(rows), bool)
+    by_lag = lag_slope * curve.lag_error_deg[rows]
+    steep = np.zeros(len(rows))
+    kept = np.ones(len(rows), bool)
     for last in (False, False, True):
         steepest = np.maximum(np.abs(amplitude_slope), np.abs(amplitude_slope - steep / free))
-        here, noise = rows[kept], np.hypot(steepest * curve.amplitude_error_nm[rows], by_lag)[kept]
+        here = rows[kept]
+        noise = np.hypot(steepest * curve.amplitude_error_nm[rows], by_lag)[kept]
         size = _size_of(values[here], noise)
         smoother = Smoother.of(place[here], noise, size)
         mean, taken = smoother.of_rows(place[here], values[here])
@@ -871,7 +878,9 @@ def what_narrows(functions: EnergyFunctions) -> str:
     What is known of an unknown i to an error e takes (S C)_i^2/(e^2 + C_ii) off the variance S C S.
     """
     branch, point = largest_of(functions.branches)
-    lever, c, row = functions.lever, functions.branches[branch].curve, functions.branches[branch].rows[0]
+    lever = functions.lever
+    c = functions.branches[branch].curve
+    row = functions.branches[branch].rows[0]
     covariance, by = lever.minimum.covariance, c.by_instrument[point]
     zero = next(i for i, n in lever.zeros if n == functions.number and lever.unknowns[i].rows[row])
 
@@ -986,7 +995,8 @@ def one_energy(
     groups = [rows for rows in groups if len(rows) >= FEWEST_ROWS]
     if not groups:
         return None
-    rows, group = np.concatenate(groups), np.repeat(np.arange(len(groups)), [len(part) for part in groups])
+    rows = np.concatenate(groups)
+    group = np.repeat(np.arange(len(groups)), [len(part) for part in groups])
     own = (group[:, None] == np.arange(len(groups))).astype(float)
 
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -167,7 +167,8 @@ def _speeds(taps: Tapping) -> Section:
     found, words = taps.speeds, ""
     if found is not None:
         here = np.isfinite(found.approach_speed_nm_per_us)
-        u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
+        u = found.approach_speed_nm_per_us[here]
+        error = found.approach_speed_error_nm_per_us[here]
         words = "Impact speeds cannot be determined from this curve."
         if len(u):
             known = f"known to {percent(float(np.median(error / u)))} in the median"

@@ -103,7 +103,8 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
     if fast.sum() >= _FEWEST_FOR_LAW:
         return ""
     f0 = curve.free_frequency_khz.value
-    s, largest = curve.drive_frequency_khz / f0, np.max(in_capture, where=np.isfinite(in_capture), initial=0.0)
+    s = curve.drive_frequency_khz / f0
+    largest = np.max(in_capture, where=np.isfinite(in_capture), initial=0.0)
     where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
     what = f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
     if not known.any():

@@ -122,7 +122,8 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
     alike = touching & ~early & ~functions.outliers, repulsive, functions.smooth
     fit, used = one_energy(lever, *alike), np.zeros(curve.rows, bool)
     if fit is not None:
-        used, scale = fit.used, np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
+        used = fit.used
+        scale = np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
         if scale_errors and scale > 1.0:
             fit = one_energy(lever, *alike, float(scale))
     silent = np.isnan(curve.lag_deg)
@@ -278,7 +279,8 @@ def with_sense_of_phase(curve: TappingCurve, stated: str) -> TappingCurve:
     """
     if not curve.has_phase:
         return curve
-    readings, zero = phase_readings(curve, free_rows(curve), ways(curve)), curve.phase_zero_deg
+    readings = phase_readings(curve, free_rows(curve), ways(curve))
+    zero = curve.phase_zero_deg
     # a zero that was set by the free tip says nothing of the sign
     sense = sense_of_phase(readings._replace(zero=None) if stated == "either" else readings, stated)
     lag, left = curve.lag_deg, sense.sign * sense.zero_deg

@@ -234,7 +234,9 @@ def _parts_at(ratio: np.ndarray, one: Tapping, branch: TappingBranch) -> Float[n
 
     The curve's own is what its errors leave open if what all have in common were known. NaN where not measured.
     """
-    curve, covariance, common = branch.curve, one.functions.lever.minimum.covariance, len(COMMON)
+    curve = branch.curve
+    covariance = one.functions.lever.minimum.covariance
+    common = len(COMMON)
     gain = np.linalg.solve(covariance[:common, :common], covariance[:common])
     estimate, noise, by = curve.estimates_at(ratio)
     own = np.maximum(np.einsum("nu,uv,nv->n", by, covariance - gain.T @ covariance[:common], by), 0.0) + noise**2

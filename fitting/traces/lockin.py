@@ -247,7 +247,8 @@ def _fault(time: np.ndarray, height: np.ndarray, period: float, order: int) -> s
     if time.shape != height.shape or time.ndim != 1 or len(time) < 2 or not np.isfinite(time + height).all():
         return "the trace must be two or more finite numbers of time and as many of the deflection"
     steps = np.diff(time)
-    typical, worst = float(np.median(steps)), int(np.argmax(np.abs(steps - np.median(steps))))
+    typical = float(np.median(steps))
+    worst = int(np.argmax(np.abs(steps - np.median(steps))))
     if steps.min() <= 0.0 or steps[worst] > 1.5 * typical:
         return (
             f"sample {worst + 2}, column time_us: the step is {steps[worst]:.6g} us, the usual one {typical:.6g} us; "
@@ -265,7 +266,9 @@ def _fault(time: np.ndarray, height: np.ndarray, period: float, order: int) -> s
 
 def _why_not_periodic(found: LockinResult) -> str | None:
     """Return why a motion is not periodic at the order asked for; None if it is."""
-    order, amplitude, sizes = found.order, found.lockin_amplitude_nm, np.nan_to_num(found.amplitudes_nm)
+    order = found.order
+    amplitude = found.lockin_amplitude_nm
+    sizes = np.nan_to_num(found.amplitudes_nm)
     # lines of a motion of the order are at its divisors
     own = order % found.orders == 0
     # errors of few blocks are uncertain: noise is alike at all lines
