@@ -215,7 +215,9 @@ def at_home(result: Any) -> Any:
 def _verdict(result: Any) -> list[Any]:
     if not hasattr(result, "valid"):
         return []
-    return ["VALID" if result.valid else "NOT VALID: do not use the numbers below.", Bullets(result.reasons)]
+    # what a result that is not valid is no measurement of: bounds of an energy may be stated all the same
+    doubt = getattr(result, "_doubt", "")
+    return ["VALID" if result.valid else f"NOT VALID{doubt}", Bullets(result.reasons)]
 
 
 _NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))

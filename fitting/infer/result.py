@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -299,6 +299,7 @@ class FitResult(Result):
         versions: of the packages that computed it.
     """
 
+    _doubt: ClassVar[str] = ": the numbers below are not a measurement of the law."
     model: str
     parameters: dict[str, FittedParameter]
     correlations: Float[np.ndarray, "p p"]
