@@ -172,7 +172,6 @@ def public_result(
     *,
     picture: str = "afm_jax.plots.results:figure_of",
     home: str = "",
-    whole: bool = True,
     **words: type[enum.IntEnum],
 ) -> Callable[[Kind], Kind]:
     """Return a decorator that makes a `Result` or `ResultTuple` a result.
@@ -180,7 +179,6 @@ def public_result(
     Args:
         picture: the function that draws it, "module:function"; as a rule its arrays against the first of them.
         home: the module that registers how it is shown; "": that of the class.
-        whole: whether its file holds all its fields, and gives it back; else what its command writes.
         words: the enumeration of each field of integers that has one.
     """
 
@@ -188,8 +186,7 @@ def public_result(
         methods = {name: method for name, method in vars(Result).items() if callable(method)}
         methods["report"] = vars(kind).get("report", Result.report)
         methods = {name: in_float64(method, loaded=True) for name, method in methods.items()}
-        known = {"_picture": picture, "_home": home, "_whole": whole, "_words": words}
-        for name, value in {**methods, **known}.items():
+        for name, value in {**methods, "_picture": picture, "_home": home, "_words": words}.items():
             setattr(kind, name, value)
         return kind
 

@@ -91,8 +91,6 @@ def saved(result: Any) -> dict[str, Any]:
         name: {str(int(each)): getattr(each, "sentence", each.name.lower().replace("_", " ")) for each in kind}
         for name, kind in getattr(type(result), "_words", {}).items()
     }
-    if not getattr(type(result), "_whole", True):
-        return head
     return head | {"afm_jax": __version__, "meanings": meanings, **_record(result, type(result).__name__)}
 
 
@@ -219,8 +217,11 @@ def _value(plain: Any) -> Any:  # noqa: PLR0911 (one return a kind of value)
 
 
 def _built(kind: type[Any], values: dict[str, Any]) -> Any:
-    """Return a record of these values; the checks of what is new are not run again."""
-    if issubclass(kind, tuple):
+    """Return a record of these values; the checks of what is new are not run again.
+
+    A class with `_by_init` computes what else it has from its fields.
+    """
+    if issubclass(kind, tuple) or hasattr(kind, "_by_init"):
         return kind(**values)
     record = object.__new__(kind)
     for field in dataclasses.fields(kind):

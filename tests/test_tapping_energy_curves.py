@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from afm_jax.saved import as_json
+from afm_jax.saved import as_json, load
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
 from fitting.tapping_curves.result import Tapping
@@ -45,10 +45,12 @@ def one_energy(rows: int = 60, energy_aj: float = ONE_ENERGY_AJ, tip: Tip = Tip(
     return curve_of_energy(tip, np.linspace(0.9, 0.15, rows), np.full(rows, energy_aj), np.ones(rows, bool))
 
 
-def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
+def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function(tmp_path: Path):
     truth = curve_like_graphite()
     table = table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(1), free_rows=30)
     result = tapping(table, law=False)
+    result.save(tmp_path / "tapping.json")
+    assert str(load(tmp_path / "tapping.json")) == str(result)
     answer = as_json(result)
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
@@ -246,6 +248,8 @@ def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_pa
     assert scatter == pytest.approx(0.052 * mean, rel=0.2)
     assert own < 0.5 * scatter
     assert abs(mean - truth.at("energy_aj", np.array(0.85), 13.4)) < 2.0 * np.hypot(common, own)
+    again = load(tmp_path / "out" / "together.json")
+    assert str(again) == (tmp_path / "out" / "together.txt").read_text().rstrip("\n")
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"together.png", "together.html"}
     # not one lever
     with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):

@@ -127,7 +127,7 @@ _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
 
 
-def repeats_of(table: AmplitudeTable | SeveralTables) -> dict[str, float] | None:
+def repeats_of(table: AmplitudeTable | SeveralTables) -> dict[str, int | float] | None:
     """Return how the readings of repeated drives scatter about their mean; None where no drive was repeated.
 
     Returns:

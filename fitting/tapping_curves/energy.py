@@ -26,7 +26,7 @@ energy. What is left says of a point that it is measured, bracketed, or below a 
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -225,6 +225,7 @@ COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
 """Unknowns that curves of one lever have in common: the first of a lever's."""
 
 
+@dataclass(init=False, eq=False)
 class Lever:
     """Curves of one lever, and the least squares that determines their instrument without the rows in contact.
 
@@ -235,6 +236,10 @@ class Lever:
         zeros: places among them of the phases' zeros, and their curves' numbers.
         minimum: of what is stated and the means of free rows.
     """
+
+    curves: tuple[TappingCurve, ...]
+    free: tuple[Mask, ...]
+    _by_init: ClassVar[bool] = True
 
     def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Mask]):
         """Find the instrument of curves with the same statements on their lever."""

@@ -70,9 +70,7 @@ class TapRows:
         return np.array([state == "free" for state in self.state])
 
 
-@public_result(
-    picture="fitting.tapping_curves.pictures:curve_figure", home="fitting.tapping_curves.report", whole=False
-)
+@public_result(picture="fitting.tapping_curves.pictures:curve_figure", home="fitting.tapping_curves.report")
 @dataclass(frozen=True, kw_only=True)
 class Tapping(JudgedResult):
     """Energy and virial of a tap along the branches of a tapping curve, and the impact law: what `tapping` returns.

@@ -49,11 +49,7 @@ class CurveScatter(CurveBranch):
     energy_common_error_aj: Float[np.ndarray, " points"]
 
 
-@public_result(
-    picture="fitting.tapping_curves.pictures:together_figure",
-    home="fitting.tapping_curves.report",
-    whole=False,
-)
+@public_result(picture="fitting.tapping_curves.pictures:together_figure", home="fitting.tapping_curves.report")
 @dataclass(frozen=True, kw_only=True)
 class TappingTogether(JudgedResult):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
