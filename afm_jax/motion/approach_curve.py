@@ -18,6 +18,7 @@ from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.scene import Scene, drive_of, require_one_frequency
 from afm_jax.apparatus.surface import drive_per_free_height, force_per_height, surface_of
 from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.contact.junction import ContactPhase
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.observe import Observables, observe
@@ -27,7 +28,9 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.outcomes import OutcomeInWords
+from afm_jax.report import Section, sections, table_of
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.saved import as_json
 
 TOLERANCE = 1e-6
 """What may remain to the steady motion, relative: a hundredth of the phase errors of good instruments."""
@@ -113,6 +116,52 @@ class ApproachCurve(ResultTuple):
     """Amplitude of the free tip, in closed form."""
     free_phase_lag_deg: float
     """Lag of the free tip behind the drive, in closed form."""
+
+    @property
+    def settles(self) -> bool:
+        """Whether the motion repeats at a height."""
+        return bool(np.isin(self.outcome, [CurveOutcome.TAPS, CurveOutcome.FREE, CurveOutcome.OTHER_ORBIT]).any())
+
+
+@csv_columns.register
+def _(curve: ApproachCurve) -> CsvColumns:
+    # a row a height
+    names = ("height_nm", "amplitude_nm", "phase_lag_deg", "dissipated_in_contact_aj", "virial_aj")
+    repeats = curve.periods > 0
+    points = {
+        **{name: getattr(curve, name) for name in names},
+        "direction": np.where(curve.retract, "retract", "approach").tolist(),
+        **{name: list(np.where(repeats, getattr(curve, name), None)) for name in ("contacts", "periods")},
+        "outcome": [CurveOutcome(kind).name.lower() for kind in curve.outcome.tolist()],
+        "reason": list(curve.reasons),
+    }
+    return {"curve_points.csv": points}
+
+
+@as_json.register
+def _(curve: ApproachCurve) -> dict[str, Any]:
+    free_tip = ("drive", "drive_frequency_khz", "free_amplitude_nm", "free_phase_lag_deg")
+    told = {name: getattr(curve, name) for name in free_tip} | {"valid": curve.settles}
+    return told | dict(csv_columns(curve)["curve_points.csv"])
+
+
+@sections.register
+def _(curve: ApproachCurve) -> list[Section]:
+    cells = {
+        "height\n(nm)": "height_nm",
+        "": "direction",
+        "amplitude\n(nm)": "amplitude_nm",
+        "lag\n(degrees)": "phase_lag_deg:.5g",
+        "lost to the\nsample (aJ)": "dissipated_in_contact_aj:.4g",
+        "outcome": "outcome",
+    }
+    free_tip = (
+        f"Free tip, driven by a {curve.drive} at {curve.drive_frequency_khz:.6g} kHz: "
+        f"{curve.free_amplitude_nm:.6g} nm, {curve.free_phase_lag_deg:.5g} degrees."
+    )
+    counts = [(kind, int(np.count_nonzero(curve.outcome == kind))) for kind in CurveOutcome]
+    said = [f"{count} of {len(curve.reasons)}: {kind.sentence}" for kind, count in counts if count]
+    return [Section("", [table_of(cells, rows_of(csv_columns(curve)["curve_points.csv"])), free_tip, *said])]
 
 
 @checked
