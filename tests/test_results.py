@@ -72,7 +72,9 @@ def of_hint(hint: Any, draw: np.random.Generator) -> Any:  # noqa: PLR0911 (one 
     if isinstance(hint, types.UnionType):
         return of_hint(inner[0], draw)
     if origin is tuple:
-        return tuple(of_hint(each, draw) for each in inner if each is not Ellipsis)
+        # as many texts as a curve has points
+        kinds = [str] * SIZES["points"] if inner == (str, ...) else [each for each in inner if each is not Ellipsis]
+        return tuple(of_hint(each, draw) for each in kinds)
     if origin is list:
         return [of_hint(inner[0], draw) for _ in range(3)]
     if origin in (dict, collections.abc.Mapping):
