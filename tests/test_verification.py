@@ -37,9 +37,14 @@ def test_every_equation_is_compared_at_ten_thousand_states_and_passes(verificati
     ("name", "element", "factor", "kind", "fails"),
     [
         ("eq5", (1, 0), np.nan, PAPER, {"eq. 5"}),
-        ("eq7", (1, 1), -1.0, PAPER, {"eq. 7"}),
-        ("flight_jacobian", (1, 1), -1.0, DAMPED, {"eq. 5, damped", "eqs. 5+7, damped"}),
-        ("impact_jacobian", (0, 1), -1.0, DELAYED, {"eq. 7, damped, delayed", "eqs. 5+7, damped, delayed"}),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (
+                ("eq7", (1, 1), -1.0, PAPER, {"eq. 7"}),
+                ("flight_jacobian", (1, 1), -1.0, DAMPED, {"eq. 5, damped", "eqs. 5+7, damped"}),
+                ("impact_jacobian", (0, 1), -1.0, DELAYED, {"eq. 7, damped, delayed", "eqs. 5+7, damped, delayed"}),
+            )
+        ),
     ],
 )
 def test_a_wrong_element_is_found(monkeypatch, name, element, factor, kind, fails):
