@@ -33,9 +33,9 @@ HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
 def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Run a function as the command `trial` of afm-jax."""
 
-    def run(body: Callable[..., Output | None], *arguments: str, function: str = "trial") -> Result:
+    def run(body: Callable[..., Output | None], *arguments: str) -> Result:
         monkeypatch.setattr(trial_commands, "body", body)
-        row = Command("trial", "Check", f"tests.trial_commands:{function}", computes=False)
+        row = Command("trial", "Check", "tests.trial_commands:trial", computes=False)
         monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])
 

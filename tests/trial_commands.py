@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from afm_jax.cli.scenes import NamedScene
-
 
 def body(*arguments: Any) -> Any:
     """Do nothing."""
@@ -12,8 +10,3 @@ def body(*arguments: Any) -> Any:
 def trial(session: Any) -> Any:
     """Try."""
     return body(session)
-
-
-def trial_of_a_scene(session: Any, scene: NamedScene) -> Any:
-    """Try."""
-    return body(session, scene)

@@ -419,7 +419,7 @@ def _touched_by_scipy(
 def _flown_by_scipy(
     programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
 ) -> tuple[np.ndarray, Tip]:
-    """Return that the tip has fallen, and the tip at the end of its flight: in the lab, in plain numbers."""
+    """Return False, for a flight ends at the lower gap, and the tip there: integrated in the lab, in plain numbers."""
     *numbers, rows = programs.flight(vector)
     square, friction, longest, offset, ramp = (float(number) for number in numbers)
     waves, start = np.asarray(rows).tolist(), float(tip.time_us)

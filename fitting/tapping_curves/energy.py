@@ -953,7 +953,7 @@ class EnergyGroup:
 
     @property
     def interval95_aj(self) -> tuple[float, float]:
-        """Its 95 % interval."""
+        """Ends of the 95 % interval of the energy of a tap in aJ."""
         return self.energy_aj - TWO_SIDED_95 * self.error_aj, self.energy_aj + TWO_SIDED_95 * self.error_aj
 
 
