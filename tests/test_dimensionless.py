@@ -1,4 +1,4 @@
-"""An oscillator in its own units, against results of others: COCO, Budd and Dux, Simpson and Ghosh."""
+"""An oscillator in its own units, against results of others: COCO, Budd and Dux, Salapaka, Simpson and Ghosh."""
 
 import re
 from pathlib import Path
@@ -73,6 +73,27 @@ def test_undamped_impact_speeds_are_those_of_budd_and_dux(stop: float, admissibl
     np.testing.assert_allclose(np.sort(speeds), undamped_speeds(3.7, 0.8, 2, stop), rtol=1e-12)
     # the counts are those of the program's own tests
     assert np.asarray(orbits.admissible).sum() == admissible
+
+
+def off_a_line(quality_factor: float) -> np.ndarray:
+    """Return how far amplitude and sine of the lag of tapping tips are from lines over the gap; free amplitude 1."""
+    gaps = np.linspace(0.1, 0.95, 6)
+    readings = []
+    for gap in gaps:
+        scene = dimensionless_scene(1.0, 0.5 / quality_factor, 0.7, gap=float(gap), force=1.0 / quality_factor)
+        orbits = single_impact_orbits(scene, 1)
+        both = np.stack([orbits.drive_lockin_amplitude_nm, np.sin(np.radians(orbits.phase_lag_deg))])
+        (orbit,) = both[:, np.asarray(orbits.stable)].T
+        readings.append(orbit)
+    lines = np.polyfit(gaps, np.stack(readings), 1)
+    return np.abs(np.stack(readings) - np.outer(gaps, lines[0]) - lines[1]).max(axis=0)
+
+
+def test_amplitude_and_sine_of_the_lag_are_linear_in_the_gap():
+    """Salapaka, Chen and Cleveland, Phys. Rev. B 61, 1106 (2000): on resonance, to the first order of 1/Q."""
+    coarse, fine = off_a_line(100.0), off_a_line(400.0)
+    assert (fine < [2e-4, 4e-3]).all()
+    np.testing.assert_allclose(coarse / fine, 4.0, rtol=0.1)
 
 
 @pytest.mark.slow
