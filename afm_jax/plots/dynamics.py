@@ -73,7 +73,7 @@ def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits | OrbitTable) ->
         for name in ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us")
     )
     admissible, stable = np.asarray(reading.admissible).ravel(), np.asarray(orbits.stable).ravel()
-    figure, (left, right) = new_panels(10.0, 4.8, 1, 2)
+    figure, (impacts, heights) = new_panels(7.5, 8.0, 2)
     kinds = {
         "stable": (admissible & stable, {"marker": "o", "color": DARK}),
         "unstable": (admissible & ~stable, {"marker": "o", "color": BLUE, "markerfacecolor": "white"}),
@@ -86,17 +86,17 @@ def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits | OrbitTable) ->
         size = 8.0 if chosen.size <= _FEW else 3.0
         own = {**style, "ms": size, "label": label}
         # a line an orbit
-        left.plot(np.degrees(phase[chosen]).T, velocity[chosen].T, ls=":", lw=0.8, **own)
-        right.plot(np.max(approach[chosen], axis=1, initial=-np.inf), peak[chosen], ls="", **own)
-    left.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
+        impacts.plot(np.degrees(phase[chosen]).T, velocity[chosen].T, ls=":", lw=0.8, **own)
+        heights.plot(np.max(approach[chosen], axis=1, initial=-np.inf), peak[chosen], ls="", **own)
+    impacts.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
     # one orbit alone would have an axis of its own rounding
-    left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
-    right.set(xlim=(0.0, None), ylim=(0.0, None))
-    label_axes(left, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
-    label_axes(right, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
-    legend_once(left, figure, **_ABOVE)
-    if not left.lines:
-        left.set_title("no orbit", fontsize=12)
+    impacts.set_ylim(bottom=min(0.0, impacts.get_ylim()[0]))
+    heights.set(xlim=(0.0, None), ylim=(0.0, None))
+    label_axes(impacts, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
+    label_axes(heights, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
+    legend_once(impacts, figure, **_ABOVE)
+    if not impacts.lines:
+        impacts.set_title("no orbit", fontsize=12)
     return figure
 
 
@@ -206,15 +206,15 @@ def chart_figure(chart: StabilityChart) -> Figure:
 
     Dashed: where the probability that an orbit of an order is stable is 2.5 or 97.5 %.
     """
-    figure, (left, right) = new_panels(12.0, 5.2, 1, 2, sharex=True, sharey=True)
+    figure, (lowest_axes, attracts_axes) = new_panels(7.5, 9.5, 2, sharex=True, sharey=True)
     edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
     lowest, stable = chart.lowest_stable_order, chart.stable
     orders = [order for order in range(1, chart.orders + 1) if (lowest == order).any()] or [1]
     colours = ListedColormap([KINDS[(order - 1) % len(KINDS)] for order in range(1, orders[-1] + 1)])
     norm = BoundaryNorm(np.arange(0.5, orders[-1] + 1.0), colours.N)
     shown = np.where(lowest > 0, lowest, np.nan)
-    mesh = left.pcolormesh(*edges, shown, cmap=colours, norm=norm, rasterized=True)
-    bar = figure.colorbar(mesh, ax=left, ticks=orders)
+    mesh = lowest_axes.pcolormesh(*edges, shown, cmap=colours, norm=norm, rasterized=True)
+    bar = figure.colorbar(mesh, ax=lowest_axes, ticks=orders)
     bar.ax.set_yticklabels([f"(1,{order})" for order in orders])
     several = (stable.sum(axis=0) > 1).astype(float)
     known: list[Any] = [
@@ -222,22 +222,25 @@ def chart_figure(chart: StabilityChart) -> Figure:
     ]
     if several.any() and not several.all():
         known.append(Line2D([], [], color="black", linewidth=1.0, label="within: several orders are stable"))
-        left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
-    left.set_title("lowest stable order N", fontsize=12)
+        lowest_axes.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
+    lowest_axes.set_title("lowest stable order N", fontsize=12)
     for row in () if chart.probability is None else chart.probability.reshape(stable.shape):
         if row.min() < row.max():
             style = {"colors": DARK, "linewidths": 0.8, "linestyles": "dashed"}
-            left.contour(chart.x_values, chart.y_values, row, levels=[0.025, 0.975], **style)
+            lowest_axes.contour(chart.x_values, chart.y_values, row, levels=[0.025, 0.975], **style)
     sizes = chart.verdicts.largest_multiplier.reshape(stable.shape)
     lowest_size = np.take_along_axis(sizes, np.maximum(lowest - 1, 0)[None], axis=0)[0]
     least = float(np.nanmin(lowest_size)) if np.isfinite(lowest_size).any() else 0.0
     # a wide tongue is damped alike throughout: the colours show how it loses its stability at the edges
-    mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=min(least, 0.99), vmax=1.0, rasterized=True)
-    figure.colorbar(mesh, ax=right, label="modulus of its larger multiplier; 1: stability is lost")
-    right.set_title("how fast its orbit attracts", fontsize=12)
+    mesh = attracts_axes.pcolormesh(
+        *edges, lowest_size, cmap="cividis", vmin=min(least, 0.99), vmax=1.0, rasterized=True
+    )
+    figure.colorbar(mesh, ax=attracts_axes, label="modulus of its larger multiplier; 1: stability is lost")
+    attracts_axes.set_title("how fast its orbit attracts", fontsize=12)
     x = "first parameter" if chart.x is None else label_of(chart.x.path)
-    label_axes(left, x=x, y="second parameter" if chart.y is None else label_of(chart.y.path), grid=False)
-    label_axes(right, x=x, y="", grid=False)
+    y = "second parameter" if chart.y is None else label_of(chart.y.path)
+    label_axes(lowest_axes, x="", y=y, grid=False)
+    label_axes(attracts_axes, x=x, y=y, grid=False)
     figure.legend(handles=known, loc="outside lower center", ncols=2, fontsize=11, frameon=False)
     return figure
 

@@ -239,7 +239,7 @@ def _around(look: Look, row: int) -> tuple[float, float]:
 
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
-    picture, (whole, part) = new_panels(12.0, 5.0, 1, 2, width_ratios=[1.0, 1.5])
+    picture, (whole, part) = new_panels(7.5, 9.0, 2, height_ratios=[1.0, 1.5])
     rows = np.arange(len(look.dense.contacts.kind))[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
@@ -256,7 +256,7 @@ def force_gap_figure(look: Look) -> Figure:
         part.axvline(float(gap), color=colour, linewidth=1.0, linestyle=dashes, label=name)
     for axes in (whole, part):
         axes.axhline(0.0, color=GRID, linewidth=0.8)
-        label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
+        label_axes(axes, x="gap (nm)", y="force on the tip (nN)")
     whole.set_xlim(right=_GAP_SHOWN_NM)
     part.set(xlim=(-0.6, _GAP_SHOWN_NM), ylim=(1.1 * least - 5.0, -0.6 * least + 5.0))
     part.legend(loc="lower right", fontsize=10, framealpha=1.0)

@@ -19,7 +19,7 @@ _MOST_ROWS = 4
 
 
 def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
-    """Return variables of a sweep side by side, one below the other what has further values at each point.
+    """Return variables of a sweep one below the other; what has further values at each point has a panel for each.
 
     Args:
         found: the results, along one or two axes.
@@ -37,15 +37,12 @@ def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
     # values over two parameters are a plane, its last axis across
     plane = axes[::-1] if set(swept) == set(axes) else swept[:2]
     is_plane = len(axes) == 2 or len(swept) == 2
-    layers = {name: _layers(shown[[name]], axes) if is_plane else [shown[[name]]] for name in names}
-    rows = max(map(len, layers.values()))
-    figure, panels = new_panels(6.4 * len(names), 4.4 * rows, rows, len(names), squeeze=False)
-    for column, name in enumerate(names):
-        for row, panel in enumerate(panels[:, column]):
-            if row < len(layers[name]):
-                _draw(panel, layers[name][row], name, plane if is_plane else plane[:1])
-            else:
-                panel.set_visible(False)
+    layers = [
+        (name, layer) for name in names for layer in (_layers(shown[[name]], axes) if is_plane else [shown[[name]]])
+    ]
+    figure, panels = new_panels(7.0, 3.2 * len(layers), len(layers), squeeze=False)
+    for panel, (name, layer) in zip(panels[:, 0], layers, strict=True):
+        _draw(panel, layer, name, plane if is_plane else plane[:1])
     return figure
 
 

@@ -52,13 +52,13 @@ def _(image: TappingMap) -> list[Section]:
 
 def map_figure(result: TappingMap) -> Figure:
     """Return energy and virial over the image with colour bars, pixels out of range in grey."""
-    figure = new_figure(11.0, 5.0)
+    figure = new_figure(6.5, 9.5)
     used = result.state == PixelState.USED
     step = max(1, int(np.ceil(max(used.shape) / _MOST)))
     size = result.size_m
     extent = None if size is None else (0.0, 1e6 * size[1], 1e6 * size[0], 0.0)
     where = "um" if size is not None else "pixel"
-    for axes, name, colours in zip(figure.subplots(1, 2), ("energy", "virial"), ("viridis", "coolwarm"), strict=True):
+    for axes, name, colours in zip(figure.subplots(2), ("energy", "virial"), ("viridis", "coolwarm"), strict=True):
         image = getattr(result, name)
         low, high = np.percentile(image[used], (0.5, 99.5)) if used.any() else (0.0, 1.0)
         if name == "virial":

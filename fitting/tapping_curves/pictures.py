@@ -89,8 +89,8 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
 def together_figure(result: TappingTogether) -> Figure:
     """Return the energies of all curves over the amplitude, a panel a side, with their mean and its common error."""
     sides = [state for state in (False, True) if any(b.repulsive == state for c in result.curves for b in c.branches)]
-    figure = new_figure(max(5.0 * len(sides), 6.5), 4.6)
-    for state, axes in zip(sides, np.atleast_1d(figure.subplots(1, max(len(sides), 1))), strict=False):
+    figure = new_figure(7.0, 4.6 * max(len(sides), 1))
+    for state, axes in zip(sides, np.atleast_1d(figure.subplots(max(len(sides), 1))), strict=False):
         for one in result.curves:
             for branch in one.branches:
                 if branch.repulsive == state:
