@@ -77,7 +77,7 @@ def test_exports_are_what_the_modules_define():
         getattr(afm_jax, "Cantilevr")  # noqa: B009
 
 
-def test_help_lists_all_commands_and_each_has_json():
+def test_help_lists_all_commands_in_78_columns_and_each_has_json():
     words = " ".join(CliRunner().invoke(main.main, ["--help"]).stdout.split())
     assert [name for name, row in main.COMMANDS.items() if f" {name} {row.summary}" not in words] == []
     root = click.Context(main.main)
@@ -85,6 +85,8 @@ def test_help_lists_all_commands_and_each_has_json():
         command = main.main.get_command(root, name)
         assert command is not None
         assert any("--json" in option.opts for option in command.params), name
+        help_text = CliRunner().invoke(main.main, [name, "--help"]).stdout
+        assert [line for line in help_text.splitlines() if len(line) > 78] == [], name
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def planned(  # noqa: PLR0913
         amplitudes: the readings of a point.
         uncertainty: error of the law that is assumed where no fit gives one.
         fit: a fit to add to, as `afm-jax fit --json` writes it, or its folder.
-        model: what will be fitted; else law+delay, or the fit's.
+        model: what will be fitted, of the models of `fit`; else law+delay, or the fit's.
         mass_ng: effective mass of the tip.
         drive: what is driven; else the sample.
         **law_and_instrument: numbers of the law, and of the instrument with their errors.

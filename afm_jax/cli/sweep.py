@@ -37,15 +37,16 @@ def sweep(
 
     \b
     scene = "scene.toml"                  # or a preset
-    accuracy = 1e-6                       # of resolved contacts; may be left out
+    accuracy = 1e-6                       # of contacts; may be left out
     [record]
     what = "orbits"                       # simulation, collide, lyapunov
     orders = [1, 2]
     [[axes]]
     parameter = "platform.reduced_frequency"
-    linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
+    linear = [0.9, 1.1, 1000]             # or log, or list = [0.9, 1.0, 1.1]
     [[axes]]
-    random = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
+    random."interaction.r" = [0.9, 0.99]
+    random."interaction.epsilon".log = [1, 100]
     count = 500
     seed = 1
 

@@ -268,7 +268,7 @@ def _number(text: str, what: str, *, positive: bool) -> float:
 
 Positive = Annotated[float, Finite(positive=True)]
 CurveNumber = Annotated[int, click.IntRange(1)]
-ModelName = Annotated[str, click.Choice(MODELS)]
+ModelName = Annotated[str, click.Choice(MODELS), "MODEL"]
 Quantity = Annotated[tuple[float, float | None], ValueAndError()]
 QualityFactor = Annotated[tuple[float, float | None] | Literal["none"], ValueAndError(none="none")]
 Sensitivity = Annotated[tuple[float, float | None] | Literal["slope"], ValueAndError(slope="slope"), "NM|slope"]
