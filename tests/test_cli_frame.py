@@ -85,7 +85,7 @@ def test_help_lists_all_commands_in_78_columns_and_each_has_json():
         command = main.main.get_command(root, name)
         assert command is not None
         assert any("--json" in option.opts for option in command.params), name
-        help_text = CliRunner().invoke(main.main, [name, "--help"]).stdout
+        help_text = CliRunner().invoke(main.main, [name, "--help"], terminal_width=78).stdout
         assert [line for line in help_text.splitlines() if len(line) > 78] == [], name
 
 
