@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,12 @@ def main() -> None:
         trees["card"] = ROOT
     facts = machine(trees)
     commands = {label: tree for label, tree in trees.items() if label != "card"}
-    rows = [*python_rows(trees, options), *command_rows(commands, options), *rows_of_scipy(options)]
-    table = [facts, "", *markdown(rows, [label for label in trees if label != "here"])]
+    others = [label for label in trees if label != "here"]
+    rows: list[Row] = []
+    for row in chain(python_rows(trees, options), command_rows(commands, options), rows_of_scipy(options)):
+        rows.append(row)
+        say(markdown([row], others)[-1])
+    table = [facts, "", *markdown(rows, others)]
     sys.stdout.write("\n".join(table) + "\n")
     if options.only is None:
         begin, end = MARKS
