@@ -80,9 +80,8 @@ def test_wsxm_curves_are_read_completely():
     assert curves[4].offset_nm - curves[4].offset_nm[0] == pytest.approx(heights - heights[0], abs=1e-12)
     known = {key: curves[0].number(key) for key in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m")}
     assert known == {"free_frequency_khz": 89.7046, "quality_factor": 201.854, "spring_constant_n_per_m": 5.33904}
-    force = read_curves(FORCES)[0]
-    assert (force.amplitude, force.deflection_unit) == (None, "V")
-    assert given(force.deflection).min() == pytest.approx(-0.755, abs=1e-3)
+    with pytest.raises(TableError, match="no lockin_amplitude_nm among the channels Z, Normal force; say"):
+        read_curves(FORCES)
 
 
 def test_wsxm_curves_whose_free_amplitude_jumps_are_refused_by_name():
@@ -163,8 +162,8 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
     lever = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz")
-    others = (*lever, "deflection_nm_per_volt", "nm_per_volt")
-    assert [curve.number(key) for key in others] == pytest.approx([5.4, 200.0, 90.0, 110.0, 120.0], rel=1e-12)
+    numbers = [curve.number(key) for key in (*lever, "nm_per_volt")]
+    assert numbers == pytest.approx([5.4, 200.0, 90.0, 120.0], rel=1e-12)
     assert (curve.known["drive"].origin, curve.missing) == ("option `drive=...`", ())
     nanonis = read_curve(saved(tmp_path, nanonis_ramp()))
     assert nanonis.number("free_frequency_khz") == 90.0
@@ -251,11 +250,12 @@ def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
 
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
-    curve = read_curve(saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n"))
-    asked = 'if another channel is, say `columns="offset_nm=Z:nm,lockin_amplitude_nm=A:nm,phase_lag_deg=P:deg"`'
-    assert any(asked in note for note in curve.notes)
+    asked = 'say `columns="offset_nm=Z:nm,lockin_amplitude_nm=A:nm,phase_lag_deg=P:deg"`'
+    path = saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n")
     with pytest.raises(TableError, match=re.escape(asked)):
-        table_text(curve)
+        read_curve(path)
+    without_phase = read_curve(path, columns="lockin_amplitude_nm=A")
+    assert any(f"another channel is, {asked[:24]}" in note for note in without_phase.notes)
     # names that cannot be printed are quoted
     strange = saved(tmp_path, "offset_nm,lockin_amplit\x1dude_nm,phase_lag_deg\n" + "1,2,3\n" * 9)
     assert read_recording(strange).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
@@ -327,7 +327,7 @@ def test_approach_and_retract_that_are_mixed_are_one_branch(curve_of):
     assert any("step back" in note for note in curve.notes)
 
 
-EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
+EIGHT = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
 LEVER: dict[str, Any] = {"quality_factor": (230.0, 5.0), "free_frequency_khz": (344.6, 0.01), "drive": "force"}
 LEVER |= {"nm_per_volt": NM_PER_VOLT}
 

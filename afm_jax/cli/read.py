@@ -37,7 +37,7 @@ class ReadingOptions:
     """How an instrument's file becomes rows of a table, as `fitting.read_curves` takes it.
 
     Attributes:
-        columns: the channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as
+        columns: the channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg), as
             offset_nm=Z:um,lockin_amplitude_nm=Amp:V. Files without a head have numbered channels; approach and retract
             in two channels are APPROACH/RETRACT: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.
         drive: what drives the tip: a piezo at its base (assumed without this option), or a force (photothermal,

@@ -23,14 +23,9 @@ ROLES = {
         ("angle",),
         ("phase_lag.*", "m1p", "phase?(_.*)?", r"(lock-?in[_ ])?pha(?![a-z]*[ _]?2).*"),
     ),
-    "deflection_nm": (("length", "voltage", "force"), ("defl.*", "normal force")),
 }
 """What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case); channels
 of a second mode, Amplitude2 and Phase2, are none."""
-
-
-CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
-"""What a curve needs."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +103,7 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
 
 
 def needed_channel(
-    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE
+    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = tuple(ROLES)
 ) -> ColumnSource:
     """Return the channel that becomes a column, as `channel_of`.
 
@@ -180,7 +175,7 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
     return replace(recording, segments=two_ways(recording.segments, pairs), units=units, away=away)
 
 
-def columns_to_paste(recording: Recording, roles: Iterable[str] = CURVE) -> str:
+def columns_to_paste(recording: Recording, roles: Iterable[str] = tuple(ROLES)) -> str:
     """Return what to write for channels whose names do not tell what they are, made from the file's own channels."""
     names = recording.channels
     if names == [str(k + 1) for k in range(8)]:

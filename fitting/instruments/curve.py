@@ -66,11 +66,9 @@ class MeasuredCurve(JudgedResult):
         curves: how many the file holds.
         branch: "approach" or "retract" of each row.
         offset_nm: height of the sample over the rest position; relative if there is no `offset_origin_nm` in `known`.
-        amplitude: lock-in amplitude in `amplitude_unit`, or None.
+        amplitude: lock-in amplitude in `amplitude_unit`.
         amplitude_unit: "nm", or "V" where the sensitivity is not known.
         phase_lag_deg: lag behind the drive, or None.
-        deflection: mean deflection in `deflection_unit`, or None.
-        deflection_unit: "nm", "V" or "nN".
         free: rows of the free tip.
         bin_nm: width of the bins of height that a table of it has (0: equal heights are merged), None: rows as read.
         slope: change of the amplitude per nm of height in contact, in `amplitude_unit`, and its error; or None.
@@ -86,11 +84,9 @@ class MeasuredCurve(JudgedResult):
     curves: int
     branch: np.ndarray
     offset_nm: Float[np.ndarray, " rows"]
-    amplitude: Float[np.ndarray, " rows"] | None = None
+    amplitude: Float[np.ndarray, " rows"]
     amplitude_unit: str = "nm"
     phase_lag_deg: Float[np.ndarray, " rows"] | None = None
-    deflection: Float[np.ndarray, " rows"] | None = None
-    deflection_unit: str = "nm"
     free: Bool[np.ndarray, " rows"]
     bin_nm: float | None = None
     slope: tuple[float, float] | None = None
@@ -153,9 +149,10 @@ def read_curves(
         ValueError: if an option is impossible.
     """
     check_parameter("bin_nm", bin_nm, "not negative", optional=True)
-    of_slope = {"nm_per_volt": None} if numbers.get("nm_per_volt") == "slope" else {}
-    known = {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
-    known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
+    of_slope = numbers.get("nm_per_volt") == "slope"
+    given = given_numbers(
+        numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS, any_sign=("offset_origin_nm",)
+    )
     wanted = parse_columns(columns)
     recording = read_recording(path)
     spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
@@ -164,14 +161,14 @@ def read_curves(
         raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
     stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
-    known = recording.known | known
+    refuse_other_modes(recording.settings, recording.source, recording.channels)
+    known = recording.known | {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
+    known |= given
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
         known["drive_frequency_khz"] = replace(known["free_frequency_khz"], origin=ASSUMED_RESONANCE, error=None)
     notes = list(recording.remarks)
     sources = _sources(recording, wanted, notes)
-    if "lockin_amplitude_nm" in sources:
-        refuse_other_modes(recording.settings, recording.source, recording.channels)
     factor = wanted["phase_lag_deg"].factor if "phase_lag_deg" in wanted else None
     sense = phase_sense or ("" if factor is None else "lag")
     by_curve = groupby(_ways(recording, sources), key=lambda way: way[0])
@@ -180,26 +177,32 @@ def read_curves(
     for number, ways in enumerate(joined, start=1):
         curve = _joined(recording, ways, sources, notes, curve=number, curves=len(joined), known=dict(known))
         if _runs_away(curve):
-            curve = replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, _TURNED))
-        if not stated and not any(_as_named(curve)):
-            curve = replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
-        curves.append(_binning(_judged(curve, of_slope=bool(of_slope), stated_sense=sense), bin_nm))
+            # branches were named by the heights where the file does not name them
+            named = curve.branch if stated else np.where(curve.branch == "approach", "retract", "approach")
+            curve = replace(curve, offset_nm=-curve.offset_nm, branch=named, notes=(*curve.notes, _TURNED))
+        curves.append(_binning(_judged(curve, of_slope=of_slope, stated_sense=sense), bin_nm))
     return curves
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
+_NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
+_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
+_TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
+_Columns = dict[str, np.ndarray]
 
 
 def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:
     """Return the channels that become columns; notes say what was assumed and what is missing.
 
     Raises:
-        TableError: if there is no height.
+        TableError: if there is no height, or no amplitude.
     """
     sources = {}
     for role in ROLES:
-        source = (needed_channel if role == "offset_nm" else channel_of)(recording, role, wanted)
+        source = (channel_of if role == "phase_lag_deg" else needed_channel)(recording, role, wanted)
         if source is None:
+            paste = f"; if another channel is, {columns_to_paste(recording)}"
+            notes.append(f"{_NO_PHASE}{paste if len(recording.channels) > len(sources) else ''}.")
             continue
         channel = source.channel
         if role == "offset_nm" and role not in wanted and channel in recording.away:
@@ -208,19 +211,7 @@ def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: li
         if not recording.units.get(channel) and not (role in wanted and wanted[role].unit):
             notes.append(f'Unit: {channel} has none; {source.unit} is assumed; else `columns="{role}={channel}:UNIT"`.')
         sources[role] = source
-    missing = next((role for role in _NO if role not in sources), None)
-    if missing is not None:
-        paste = f"; if another channel is, {columns_to_paste(recording)}"
-        notes.append(f"{_NO[missing]}{paste if len(recording.channels) > len(sources) else ''}.")
     return sources
-
-
-_NO = {
-    "lockin_amplitude_nm": "There is no lock-in amplitude",
-    "phase_lag_deg": "There is no phase, so that the energy of a tap has an upper bound only",
-}
-_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
-_Columns = dict[str, np.ndarray]
 
 
 def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator[tuple[Any, str, _Columns]]:
@@ -248,22 +239,18 @@ def _joined(
     **known: Any,
 ) -> MeasuredCurve:
     """Return approach and retract, the one after the other, as a curve."""
-    scales = {"length": "nm", "voltage": "V", "force": "nN"}
-    units = {role: scales.get(quantity_of(source.unit), "") for role, source in sources.items()}
     columns = {role: np.concatenate([parts[role] for _, parts in ways]) for role in sources}
-    amplitude, phase = columns.get("lockin_amplitude_nm"), columns.get("phase_lag_deg")
-    inverted = amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0
+    amplitude, phase = columns["lockin_amplitude_nm"], columns.get("phase_lag_deg")
+    inverted = amplitude[np.argmax(np.abs(amplitude))] < 0.0
     return MeasuredCurve(
         source=recording.source,
         format=recording.format,
         branch=np.concatenate([np.full(len(parts["offset_nm"]), name) for name, parts in ways]),
         offset_nm=columns["offset_nm"],
-        amplitude=-amplitude if amplitude is not None and inverted else amplitude,
-        amplitude_unit=units.get("lockin_amplitude_nm", "nm"),
+        amplitude=-amplitude if inverted else amplitude,
+        amplitude_unit="V" if quantity_of(sources["lockin_amplitude_nm"].unit) == "voltage" else "nm",
         phase_lag_deg=None if phase is None else np.unwrap(phase, period=360.0),
-        deflection=columns.get("deflection_nm"),
-        deflection_unit=units.get("deflection_nm", "nm"),
-        free=np.zeros(len(columns["offset_nm"]), dtype=bool),
+        free=np.zeros(len(amplitude), dtype=bool),
         notes=(*notes, _INVERTED) if inverted else tuple(notes),
         **known,
     )
@@ -295,7 +282,7 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
 
 def _runs_away(curve: MeasuredCurve) -> bool:
     """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
-    if curve.amplitude is None or any(look.slope is not None for look in _looks(curve).values()):
+    if any(look.slope is not None for look in _looks(curve).values()):
         return False
     amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
     some = max(len(amplitude) // 20, 1)
@@ -307,9 +294,6 @@ def _as_named(curve: MeasuredCurve) -> list[bool]:
     """Say of every branch whether its heights rise in an approach, or fall in a retract."""
     ways = ways_of(curve.offset_nm, curve.branch)
     return [bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways.items()]
-
-
-_TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
 
 
 def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
@@ -326,8 +310,6 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
 
 def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
-    if curve.amplitude is None:
-        return curve
     known, looks, notes = curve.known, _looks(curve), list(curve.notes)
     slope = _mean_slope(looks) if of_slope else None
     if slope is not None:
@@ -357,13 +339,10 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    offset = curve.offset_nm
-    amplitude = np.asarray(curve.amplitude)
-    lag = curve.phase_lag_deg
-    looks = {}
+    lag, looks = curve.phase_lag_deg, {}
     for branch in dict.fromkeys(curve.branch.tolist()):
         here = curve.branch == branch
-        looks[branch] = look_at(offset[here], amplitude[here], None if lag is None else lag[here])
+        looks[branch] = look_at(curve.offset_nm[here], curve.amplitude[here], None if lag is None else lag[here])
     return looks
 
 
@@ -483,7 +462,7 @@ def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Ph
         frequency_error=errors[0],
         quality_factor=value["quality_factor"],
         quality_error=errors[1],
-        ratio=np.asarray(curve.amplitude) / level,
+        ratio=curve.amplitude / level,
         ratio_error=value.get("amplitude_error_nm", 0.01 * level) / level * ones,
         phase_deg=np.asarray(curve.phase_lag_deg),
         phase_error_deg=value["phase_error_deg"] * ones,
@@ -517,9 +496,6 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
         TableError: if something is missing, naming the options that give it, or the curve must not be used.
     """
     where, known = f"{curve.source}, curve {curve.curve}", curve.known
-    if curve.amplitude is None:
-        why = next(note for note in curve.notes if note.startswith(_NO["lockin_amplitude_nm"]))
-        raise TableError(f"{where}: it gives no table. {why}")
     if curve.reasons:
         raise TableError(f"{where}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
@@ -563,7 +539,7 @@ def zero_of_free_rows(error: float) -> str:
 
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a curve's table, its bins or the rows as they were read, and if they are in order of time."""
-    readings = {"lockin_amplitude_nm": np.asarray(curve.amplitude)}
+    readings = {"lockin_amplitude_nm": curve.amplitude}
     known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
     if curve.phase_lag_deg is not None:
         readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]

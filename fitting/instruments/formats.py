@@ -32,12 +32,13 @@ from fitting.instruments.recording import (
     unit_named,
 )
 from fitting.tables.csv_text import (
-    DECIMAL_COMMA,
     NUMBER,
     NumberedLines,
+    Source,
     TableError,
-    cells_of,
+    numbers_of,
     read_bytes,
+    read_cells,
     split_lines,
     text_of,
 )
@@ -95,28 +96,23 @@ def parse_text(data: bytes, name: str) -> Recording:
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]
     header = {pair[0]: re.sub(r"^(\[.*?\])\s*(.*?)\s*$", r"\2 \1", pair[1]) for pair in pairs if len(pair) == 2}
     columns, units = _columns([row for row in rows if row[0] > start], name)
-    count = len(next(iter(columns.values()), ()))
     kind, away, remarks = ("Nanonis text", ("Z rel", "Z"), ()) if start else ("separated text", (), ())
-    runs = np.zeros(count)
+    runs = np.zeros(len(next(iter(columns.values()), ())))
     if any("neaspec" in comment.lower() for _, comment in comments):
         kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
         remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
-        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [count]
-        declared = int(np.prod([int(pixel) for pixel in pixels[:3]]))
-        if count % max(declared, 1) or count < declared:
-            raise cut_off(name, f"the header announces {declared} rows, but {count} are there")
         columns = {title: numbers for title, numbers in columns.items() if re.fullmatch(r"Z|[MO]\d[AP]", title)}
         units = {title: {"Z": "m", "A": "nm", "P": "rad"}[title[-1]] for title in columns}
-    segments = [
+    segments = tuple(
         Segment(number, "", {title: numbers[runs == run] for title, numbers in columns.items()})
         for number, run in enumerate(dict.fromkeys(runs.tolist()), start=1)
-    ]
-    back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
+    )
+    back = {title.removeprefix(BACK): title for title in columns if title.startswith(BACK)}
     if back:
         # the height is written once where forward and backward stood at the same heights
         pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
         segments = two_ways(segments, pairs)
-    return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
+    return Recording(kind, name, segments, units, known_from(header), away, remarks, header)
 
 
 def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -125,62 +121,35 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     Raises:
         TableError: if a row has another number of cells than the first.
     """
-    # the last row may be cut off
-    separator = _separator_of(rows[len(rows) // 2][1]) if rows else ","
-    # a tab that ends a row is a blank cell where the first row ends without
-    ending = "\t" if separator == "\t" and not rows[0][1].endswith("\t") else ""
-    body = [[_with_point(cell, separator) for cell in cells_of(line + ending, separator)] for _, line in rows]
-    titles = body[0] if rows else []
-    if rows and (len(titles) < 2 or (separator == " " and not all(map(NUMBER.fullmatch, titles)))):
-        raise TableError(
-            f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
-        )
-    odd = next((k for k, cells in enumerate(body) if len(cells) != len(titles)), None)
-    if odd is not None:
-        raise cut_off(f"{name}, line {rows[odd][0]}", f"there are {len(body[odd])} cells for {len(titles)} columns")
+    if not rows:
+        return {}, {}
+    titles, *body = read_cells(rows, Source(name))
     if any(map(NUMBER.fullmatch, titles)):
-        titles = [str(k + 1) for k in range(len(titles))]
-    else:
-        titles = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)]
-        body = body[1:]
-        ways = [WAY.search(title) for title in titles]
-        back = ["[bwd] " if way and way[1] == "Rt" else "" for way in ways]
-        titles = [mark + WAY.sub("", title) for mark, title in zip(back, titles, strict=True)]
-    named = [_name_and_unit(title) for title in titles]
-    units = {plain.replace("[bwd]", "").strip(): unit for plain, unit in named}
-    numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
-    numbers = numbers.reshape(len(body), len(titles))
-    columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
-    return columns, units
+        titles, body = [str(number) for number, _ in enumerate(titles, start=1)], [titles, *body]
+    named = [name_and_unit(printable(title) or f"column {number}") for number, title in enumerate(titles, start=1)]
+    columns = {title: numbers_of(cells) for (title, _), cells in zip(named, zip(*body, strict=True), strict=False)}
+    return columns, {title.removeprefix(BACK): unit for title, unit in named}
 
 
-def _name_and_unit(text: str) -> tuple[str, str]:
-    """Return the name and the unit of a column such as 'Amp (V)', 'Z [nm]', 'Z/nm' or 'phase_deg'.
+def name_and_unit(title: str) -> tuple[str, str]:
+    """Return the name of a column, behind `BACK` of the way back, and its unit.
 
-    >>> _name_and_unit("Amp (V)"), _name_and_unit("Z/µm"), _name_and_unit("height_nm"), _name_and_unit("Z")
-    (('Amp', 'V'), ('Z', 'um'), ('height_nm', 'nm'), ('Z', ''))
+    >>> name_and_unit("Amp (V)"), name_and_unit("Z/µm"), name_and_unit("height_Rt_nm"), name_and_unit("Z")
+    (('Amp', 'V'), ('Z', 'um'), ('[bwd] height_nm', 'nm'), ('Z', ''))
     """
-    match = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]]*)[\])]", text.strip())
-    if match:
-        return match[1], unit_named(match[2])
-    for sign in "/_":
-        name, found, unit = text.strip().rpartition(sign)
-        if found and unit_named(unit) in UNITS:
-            return (name if sign == "/" else text.strip()), unit_named(unit)
-    return text.strip(), ""
+    text = re.sub(rf"\s*\[bwd\]|{WAY.pattern}", "", title).strip()
+    mark = BACK if re.search(r"\[bwd\]|_Rt(?=_|$)", title) else ""
+    in_brackets = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]]*)[\])]", text)
+    if in_brackets:
+        return mark + in_brackets[1], unit_named(in_brackets[2])
+    ending = re.fullmatch(r"(.*)([/_])([^/_]*)", text)
+    if ending and unit_named(ending[3]) in UNITS:
+        return mark + (ending[1] if ending[2] == "/" else text), unit_named(ending[3])
+    return mark + text, ""
 
 
-def _separator_of(row: str) -> str:
-    """Return what separates numbers: commas only where they are no decimal commas."""
-    for sign in "\t; ":
-        cells = [_with_point(cell, sign) for cell in cells_of(row, sign) if cell]
-        if len(cells) > 1 and all(map(NUMBER.fullmatch, cells)):
-            return sign
-    return next((sign for sign in "\t;," if sign in row), " ")
-
-
-def _with_point(cell: str, separator: str) -> str:
-    return cell.replace(",", ".") if separator != "," and DECIMAL_COMMA.fullmatch(cell) else cell
+BACK = "[bwd] "
+"""What the name of a channel of the way back begins with."""
 
 
 # ---- WSxM and NanoSurf
@@ -329,10 +298,9 @@ def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]
 
     What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
     """
-    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
-    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
-    # behind a header of 64 bytes; version 5 is the only one with labels
-    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
+    sizes = [int(size) for size in header.get("dimLabelsSize", [0])]
+    # the labels of all sides stand in front of the file's end; version 5 is the only one with labels
+    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[side:])
     fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
     # UTF-8 since version 7 of Igor
     texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]

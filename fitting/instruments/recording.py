@@ -143,7 +143,6 @@ _HEADER = {
     "quality_factor": ("", "", "Q|Quality factor (Q)|Q Factor:|ThermalQ"),
     "spring_constant_n_per_m": ("N/m", "N/m", "Force constant|Spring Constant:|SpringConstant"),
     "free_amplitude_nm": ("nm", "", ""),
-    "deflection_nm_per_volt": ("nm/V", "m/V", "InvOLS"),
     "nm_per_volt": ("nm/V", "m/V", "AmpInvOLS"),
     "averages": ("", "", "Averages"),
 }
