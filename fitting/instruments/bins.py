@@ -1,6 +1,6 @@
 """Bins of height: curves whose heights repeat or are not in order, as rows that a table can hold.
 
-A bin's row is the mean of the readings in it. Its error is their scatter about a straight line over the height, pooled
+A bin's row is the mean of the readings in it. Its error is their scatter about the line through the means, pooled
 with that of the neighbouring bins, over the root of their number: in contact readings scatter more than those of the
 free tip, because the height does. Where the farther free bins scatter about a straight line in time by more than their
 errors (noise that is not independent from row to row), all errors are multiplied by that.
@@ -98,26 +98,14 @@ def _means(place: Places, values: Rows) -> Bins:
 
 
 def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
-    """Return the scatter of single readings about a line over the height, in each bin and its neighbours."""
-    # bins of few rows are taken together
-    group, held = [0], 0
-    for count in np.bincount(place).tolist():
-        full = held >= _ROWS
-        group.append(group[-1] + full)
-        held = count + (0 if full else held)
-    last = group[-1] - (held < _ROWS and group[-1] > 0)
-    groups = np.minimum(group[1:], last)
-    of_row = groups[place]
-    rows = np.bincount(of_row).astype(float)
-    x, y = (numbers - _means(of_row, numbers)[of_row] for numbers in (height, values))
-    # a column of one height, or of one number, has no slope
-    width = _means(of_row, x * x)
-    slope = np.where(width > 0.0, _means(of_row, x * y) / np.where(width > 0.0, width, 1.0), 0.0)
-    squares = np.bincount(of_row, (y - slope[of_row] * x) ** 2)
-    freedom = np.maximum(rows - 2.0, 0.0)
+    """Return the scatter of single readings about the line through the bins' means, in each bin and its neighbours."""
+    line = np.interp(height, _means(place, height), _means(place, values))
+    squares = np.bincount(place, (values - line) ** 2)
     window = np.ones(2 * _NEIGHBOURS + 1)
-    pooled, free = (np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, freedom))
-    return np.sqrt(pooled / np.maximum(free, 1.0))[groups]
+    pooled, freedom = (
+        np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, np.bincount(place) - 1.0)
+    )
+    return np.sqrt(pooled / np.maximum(freedom, 1.0))
 
 
 def _excess(values: Bins, errors: Bins, time: Bins) -> float:

@@ -30,7 +30,7 @@ from fitting.instruments.columns import (
     turns_of,
 )
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, free_lag_deg, sense_of_phase
+from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, sense_of_phase
 from fitting.instruments.recording import (
     ASSUMED_RESONANCE,
     UNIT_OF,
@@ -432,15 +432,11 @@ def _add_phase(
         notes.append("Zero: the phase has the instrument's own zero; free frequency and Q would determine it.")
         return SENSES.get(stated, 1.0) * phase
     readings = _phase_readings(curve, looks)
+    readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
-    readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
-    s = readings.frequency_ratio[0]
-    quality = readings.quality_factor
-    either = np.array([1.0, -1.0])
-    of_ratio = free_lag_deg(readings.drive, s * (1.0 + readings.frequency_error * either), quality)
-    of_quality = free_lag_deg(readings.drive, s, quality * (1.0 + readings.quality_error * either))
-    error = float(np.linalg.norm([max(scatter, 0.01), 0.5 * np.ptp(of_ratio), 0.5 * np.ptp(of_quality)]))
+    by_instrument = [float(other.free_lag_deg[0]) - lag for other in readings.disturbed]
+    error = float(np.linalg.norm([max(scatter, 0.01), *by_instrument]))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
     sense = sense_of_phase(readings, stated)
     known["phase_zero_deg"] = Known(sense.zero_deg, "deg", how, error)

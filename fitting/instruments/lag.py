@@ -90,6 +90,15 @@ class PhaseReadings(NamedTuple):
         return free_lag_deg(self.drive, self.frequency_ratio, self.quality_factor)
 
     @property
+    def disturbed(self) -> tuple["PhaseReadings", "PhaseReadings"]:
+        """The readings with another frequency, and with another Q: by the standard error of each."""
+        ratio, quality = self.frequency_ratio, self.quality_factor
+        return (
+            self._replace(frequency_ratio=ratio * (1.0 + self.frequency_error)),
+            self._replace(quality_factor=quality * (1.0 + self.quality_error)),
+        )
+
+    @property
     def seen_free(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the free tip that have a phase."""
         return self.free & np.isfinite(self.phase_deg)
@@ -157,12 +166,8 @@ class PhaseReadings(NamedTuple):
         lag_error = np.hypot(self.phase_error_deg, 0.5)
         if not self.seen_free.any() and self.zero is not None:
             lag_error = np.hypot(lag_error, self.zero[1])
-        changes = (
-            {"ratio": self.ratio + self.ratio_error},
-            {"frequency_ratio": self.frequency_ratio * (1.0 + self.frequency_error)},
-            {"quality_factor": self.quality_factor * (1.0 + self.quality_error)},
-        )
-        moved = [self.energy(behind + lag_error), *(self._replace(**change).energy(behind) for change in changes)]
+        others = (self._replace(ratio=self.ratio + self.ratio_error), *self.disturbed)
+        moved = [self.energy(behind + lag_error), *(other.energy(behind) for other in others)]
         error = np.linalg.norm(np.array(moved) - start, axis=0)
         with np.errstate(invalid="ignore"):
             return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))

@@ -238,10 +238,6 @@ _OTHER_MODES = re.compile(
     re.IGNORECASE,
 )
 _MODE_KEYS = re.compile(r"((imaging|operating|operation|op\.|afm|feedback|scan)[ _-]?)?mode", re.IGNORECASE)
-_STRICT_KEYS = {"ImagingMode", "Op. mode"}
-"""Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
-
-
 _OTHER_CHANNELS = re.compile(
     r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
     re.IGNORECASE,
@@ -258,10 +254,8 @@ def refuse_other_modes(settings: Mapping[str, str], source: str, channels: Itera
     found = [f"holds a channel {name!r}, which is none of" for name in channels if _OTHER_CHANNELS.fullmatch(name)]
     for key, value in settings.items():
         name = re.split(r"::|[/:]", key)[-1].strip()
-        others = _AMPLITUDE_MODES.sub("", value)
-        strict = name in _STRICT_KEYS and others == value
-        bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
-        if bimodal or strict or (_MODE_KEYS.fullmatch(name) and _OTHER_MODES.search(others)):
+        other = _MODE_KEYS.fullmatch(name) and _OTHER_MODES.search(_AMPLITUDE_MODES.sub("", value))
+        if other or (name == "DualACMode" and value.strip() not in {"", "0"}):
             found.insert(0, f"was recorded in the mode {printable(value)!r} ({printable(key)}), not in")
     if found:
         why = "amplitude modulation (tapping) of one mode; its amplitude and phase do not give the energy of a tap"
