@@ -221,14 +221,12 @@ def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator
     """
     for segment in recording.segments:
         columns = _converted(recording, segment, sources)
-        if segment.branch:
-            yield segment.curve, segment.branch, columns
-            continue
         offset = columns["offset_nm"]
-        for number, (first, last) in enumerate(pairwise([0, *turns_of(offset), len(offset)])):
-            branch = "approach" if offset[last - 1] >= offset[first] else "retract"
+        turns = [] if segment.branch else turns_of(offset)
+        for number, (first, last) in enumerate(pairwise([0, *turns, len(offset)])):
+            direction = "approach" if offset[last - 1] >= offset[first] else "retract"
             part = {role: numbers[first:last] for role, numbers in columns.items()}
-            yield (segment.curve, number // 2), branch, part
+            yield (segment.curve, number // 2), segment.branch or direction, part
 
 
 def _joined(
@@ -262,22 +260,21 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
     Raises:
         TableError: if a number is none, or impossible.
     """
-    where = f"{recording.source}, curve {segment.curve}"
-    raw = {role: segment.channels[source.channel] for role, source in sources.items()}
-    # rows at the end that hold nothing, or zeros alone, are the padding of a shorter way
-    held = np.flatnonzero(np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in raw.values()], axis=0))
     columns = {}
+    with np.errstate(over="ignore", invalid="ignore"):
+        for role, source in sources.items():
+            columns[role] = segment.channels[source.channel] * (UNITS[source.unit][1] * (source.factor or 1.0))
+    # rows at the end that hold nothing, or zeros alone, are the padding of a shorter way
+    held = np.flatnonzero(np.any([~np.isnan(numbers) & (numbers != 0.0) for numbers in columns.values()], axis=0))
+    rows = held[-1] + 1 if held.size else None
     for role, source in sources.items():
-        with np.errstate(over="ignore", invalid="ignore"):
-            numbers = raw[role] * (UNITS[source.unit][1] * (source.factor or 1.0))
-        columns[role] = numbers[: held[-1] + 1] if held.size else numbers
-        bad = np.flatnonzero(~(np.abs(columns[role]) < 1e9))
+        bad = np.flatnonzero(~(np.abs(columns[role][:rows]) < 1e9))
         if bad.size:
-            what = "beyond 1e9; give its unit" if np.isfinite(raw[role][bad[0]]) else "not a number; remove the row"
+            where = f"{recording.source}, curve {segment.curve}, row {bad[0] + 1}, channel {source.channel}"
             raise TableError(
-                f"{where}, row {bad[0] + 1}, channel {source.channel}: is {what}, or export the file again"
+                f"{where}: is no number below 1e9; give its unit, remove the row, or export the file again"
             )
-    return columns
+    return {role: numbers[:rows] for role, numbers in columns.items()}
 
 
 def _runs_away(curve: MeasuredCurve) -> bool:
@@ -382,10 +379,9 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
     noise = max((look.noise for look in looks.values() if look.noise > 0.0), default=0.0)
     measured = "measured: scatter of the free rows"
     if curve.amplitude_unit == "nm":
-        if not any(look.jump for look in looks.values()):
-            how = f"measured: median of {curve.free.sum()} free rows"
-            error = max(v.level_error for v in looks.values())
-            known.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
+        how = f"measured: median of {curve.free.sum()} free rows"
+        error = float(max(look.level_error for look in looks.values()))
+        known.setdefault("free_amplitude_nm", Known(level, "nm", how, error))
         how = measured if noise else "assumed: 1 % of the free amplitude"
         known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
     if curve.phase_lag_deg is not None:

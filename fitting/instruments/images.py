@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from afm_jax.words import printable
 from fitting.instruments.columns import needed_channel, parse_columns
-from fitting.instruments.formats import IGOR, parse_igor
+from fitting.instruments.formats import IGOR, name_and_unit, parse_igor
 from fitting.instruments.recording import (
     UNITS,
     Known,
@@ -109,8 +109,7 @@ def _read(path: str | Path) -> Recording:
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
             arrays = loaded if hasattr(loaded, "files") else dict(zip(_ROLES.values(), loaded, strict=False))
             arrays = {printable(key): array for key, array in arrays.items()}
-            spelled = {unit.lower(): unit for unit in UNITS}
-            units = {key: spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
+            units = {key: name_and_unit(key)[1] for key in arrays}
             images = {key: image for key, image in arrays.items() if image.ndim == 2 and image.dtype.kind in "fiu"}
             if not images:
                 raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")

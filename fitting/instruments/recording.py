@@ -30,7 +30,7 @@ _SIZES = {
 }
 UNITS = {unit: (quantity, size) for quantity, sizes in _SIZES.items() for unit, size in sizes.items()}
 """What a unit measures, and its size in this package's unit: nm, V, degrees, kHz, nN, N/m, nm/V, nm per root Hz."""
-_SPELLINGS = {"µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
+_SPELLINGS = {"v": "V", "µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
 
 
 def unit_named(text: str) -> str:
