@@ -312,8 +312,8 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     if slope is not None:
         # with this scale the amplitude falls by 1 nm per nm in contact
         scale = 1.0 / abs(slope[0])
-        found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
-        parts = " and ".join(f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found)
+        found = [(branch, look.slope.offsets_nm) for branch, look in looks.items() if look.slope is not None]
+        parts = " and ".join(f"{branch} from {at[0]:.2f} to {at[-1]:.2f} nm" for branch, at in found)
         how = f"measured: slope of the steepest settled part ({parts}), assumed to be 1 nm per nm (a hard sample)"
         known["nm_per_volt"] = Known(scale, f"nm/{curve.amplitude_unit}", how, scale * slope[1] / abs(slope[0]))
     if "nm_per_volt" in known and (slope is not None or curve.amplitude_unit == "V"):
@@ -336,10 +336,11 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    lag, looks = curve.phase_lag_deg, {}
+    looks = {}
+    lag = np.zeros(len(curve.offset_nm)) if curve.phase_lag_deg is None else curve.phase_lag_deg
     for branch in dict.fromkeys(curve.branch.tolist()):
         here = curve.branch == branch
-        looks[branch] = look_at(curve.offset_nm[here], curve.amplitude[here], None if lag is None else lag[here])
+        looks[branch] = look_at(curve.offset_nm[here], curve.amplitude[here], lag[here])
     return looks
 
 
