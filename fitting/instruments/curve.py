@@ -150,9 +150,7 @@ def read_curves(
     """
     check_parameter("bin_nm", bin_nm, "not negative", optional=True)
     of_slope = numbers.get("nm_per_volt") == "slope"
-    given = given_numbers(
-        numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS, any_sign=("offset_origin_nm",)
-    )
+    given = given_numbers(numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS)
     wanted = parse_columns(columns)
     recording = read_recording(path)
     spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))

@@ -9,7 +9,6 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -278,19 +277,10 @@ def parse_igor(data: bytes, name: str) -> Recording:
     columns = {
         label: (numbers[..., ::-1, k].T if side == 2 else numbers[:, k].copy()) for k, label in enumerate(labels)
     }
-    # the row of an index is the last of its segment
-    ends = [0, *(int(index) + 1 for index in header.get("Indexes", "").split(",")[1:])]
-    ways = [{"1": "approach", "-1": "retract"}.get(way.strip()) for way in header.get("Direction", "").split(",")[1:]]
-    segments = [
-        Segment(1, way, {label: column[first:last] for label, column in columns.items()})
-        for (first, last), way in zip(pairwise(ends), ways, strict=False)
-        if way is not None
-    ]
     sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
     size = None if None in sides else (sides[0][0], sides[1][0])  # type: ignore[index]
-    whole = (Segment(1, "", columns),) if side == 2 or not segments else tuple(segments)
     kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
-    return Recording(kind, name, whole, units, known, settings=header, size_m=size)
+    return Recording(kind, name, (Segment(1, "", columns),), units, known, settings=header, size_m=size)
 
 
 def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:

@@ -22,7 +22,6 @@ _SIZES = {
     "voltage": {"V": 1.0, "mV": 1e-3},
     "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
     "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
-    "force": {"N": 1e9, "nN": 1.0, "pN": 1e-3},
     "stiffness": {"N/m": 1.0},
     "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
     "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
@@ -185,15 +184,12 @@ UNIT_OF = {
 """Numbers of lever, drive and instrument that a caller may give, with their units."""
 
 
-def given_numbers(
-    numbers: Mapping[str, Any], units: Mapping[str, str], *, any_sign: Sequence[str] = ()
-) -> dict[str, Known]:
+def given_numbers(numbers: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Known]:
     """Return what a caller gives of the instrument, by name.
 
     Args:
         numbers: each a number, a pair with its standard error or a text such as '44 +- 4'; None: not given.
         units: of those that may be given.
-        any_sign: those that need not be above 0.
 
     Raises:
         TypeError: if there is none of a name.
@@ -204,7 +200,7 @@ def given_numbers(
         if key not in units:
             raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
         if given is not None:
-            number, error = given_value(key, given, any_sign=key in any_sign)
+            number, error = given_value(key, given, any_sign=key in {"free_phase_deg", "offset_origin_nm"})
             found[key] = Known(number, units[key], f"option `{key}=...`", error)
     return found
 
