@@ -148,8 +148,7 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
 
     A curve that first falls slowly (attraction) and then by 1 nm per nm (a hard sample) tells the scale of its
     amplitude by the second part only. Lines are laid through all windows of a nm or more; of those as steep as the
-    steepest within their errors the one nearest to the sample is taken, longer where its slope is known to worse than
-    3 % and the rows before it lie on the same line.
+    steepest within their errors the one nearest to the sample is taken.
 
     Args:
         offset: heights, rising.
@@ -163,26 +162,23 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     # 1 nm at least
     length = max(1.0, 5.0 * float(np.median(np.diff(offset))))
     starts = np.searchsorted(offset, offset - length, side="left").tolist()
-    lines = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
-    windows = [(a, b, line) for a, b, line in lines if line is not None]
-    # windows that the far end cuts off count only where there is no whole one
-    whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
+    # windows that the far end cuts off are left out
+    ends = [(a, b) for b, a in enumerate(starts, start=1) if b - a > 3 and offset[b - 1] - offset[0] >= length]
+    windows = [(a, b, line) for a, b in ends if (line := _line(offset[a:b], values[a:b]))]
     chosen = _line(offset, values)
     first, last, usual = 0, rows, 0.0
-    if whole:
-        slopes, errors, scatters = np.array([line for *_, line in whole]).T
+    if windows:
+        slopes, errors, scatters = np.array([line for *_, line in windows]).T
         # settled is a window that scatters about its line by at most three times what most do, or 6 % of its fall: of a
         # jump a line leaves 17 %
         usual = float(np.median(scatters))
         settled = scatters <= np.maximum(3.0 * usual, 0.06 * length * np.abs(slopes)) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
-        start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
-        start = _straight_from(offset[: end + 1], values[: end + 1], start)
-        part = _line(offset[start : end + 1], values[start : end + 1])
+        nearest = windows[int(np.flatnonzero(alike)[-1])]
         # with a plateau the line through all rows has less than 0.8 of the slope of the steepest part
-        if not (deep and part is not None and chosen is not None and chosen[0] < 0.8 * part[0]):
-            chosen, first, last = part, start, end + 1
+        if not (deep and chosen is not None and chosen[0] < 0.8 * nearest[2][0]):
+            first, last, chosen = nearest
     # a slope differs from 0 by four standard errors
     if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
@@ -191,20 +187,6 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     error = max(chosen[1], usual / float(np.linalg.norm(part - part.mean())))
     bend = 0.1 * float(np.hypot(*_change_of_slope(part, values[first:last])))
     return ContactSlope(chosen[0], error, bend, part, float(values[first:last].mean()))
-
-
-def _straight_from(offset: Rows, values: Rows, first: int) -> int:
-    """Return from which row on the slope is known to 3 %, as far as the rows up to the last lie on a line."""
-    step = max(len(offset) - first, 4) // 4
-    while first > 0:
-        line = _line(offset[first:], values[first:])
-        trial = max(first - step, 0)
-        known = line is not None and line[1] < 0.03 * abs(line[0])
-        change, error = _change_of_slope(offset[trial:], values[trial:])
-        if known or len(offset) - trial < 6 or abs(change) > 2.0 * error + 1e-12 * abs(values[-1]):
-            break
-        first = trial
-    return first
 
 
 def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:
