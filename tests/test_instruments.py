@@ -104,7 +104,7 @@ def test_a_nanosurf_spectrum_is_what_their_own_package_reads():
     wanted = {"spring_constant_n_per_m": 27.13, "quality_factor": 442.0, "temperature_k": pytest.approx(313.15)}
     assert known == wanted
     np.testing.assert_allclose(channels["Frequency"], np.arange(8369) * 319214.0 / 8368.0, rtol=1e-14)
-    with pytest.raises(TableError, match="holds a thermal spectrum"):
+    with pytest.raises(TableError, match="holds a spectrum or a resonance sweep"):
         read_curve(THERMAL)
 
 

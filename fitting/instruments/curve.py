@@ -153,10 +153,8 @@ def read_curves(
     given = given_numbers(numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS)
     wanted = parse_columns(columns)
     recording = read_recording(path)
-    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
-    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
-        what = "thermal spectrum" if spectrum else "resonance sweep"
-        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
+    if any(name.startswith("Frequency") for name in recording.channels):
+        raise TableError(f"{recording.source}: holds a spectrum or a resonance sweep; `afm-jax calibrate` fits it")
     stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
     refuse_other_modes(recording.settings, recording.source, recording.channels)
@@ -276,9 +274,7 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
 
 
 def _runs_away(curve: MeasuredCurve) -> bool:
-    """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
-    if any(look.slope is not None for look in _looks(curve).values()):
-        return False
+    """Say whether heights grow away from the sample: the amplitude is smaller at their lower end."""
     amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
     some = max(len(amplitude) // 20, 1)
     # heights run the other way where the far end has less than 0.95 of the amplitude near the sample

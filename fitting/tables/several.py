@@ -66,12 +66,11 @@ class SeveralTables:
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """What each table is called: its file's name; its path, or this and a number, where that is another's too."""
-        paths = [table.source for table in self.tables]
-        for names in (tuple(Path(path).name for path in paths), tuple(paths)):
-            if len(set(names)) == len(names):
-                return names
-        return tuple(f"{path} ({number})" for number, path in enumerate(paths, 1))
+        """What each table is called: its file's name; its path and number where two files have one name."""
+        names = [Path(table.source).name for table in self.tables]
+        if len(set(names)) == len(names):
+            return tuple(names)
+        return tuple(f"{table.source} ({number})" for number, table in enumerate(self.tables, 1))
 
     @property
     def source(self) -> str:
