@@ -124,7 +124,6 @@ def without_names(separator: str) -> str:
 
 RAMP = {"drive": "force"}
 NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"}
-SIDE_BY_SIDE = {"columns": BRUKER, "nm_per_volt": 50.0}
 
 
 @pytest.mark.parametrize(
@@ -134,7 +133,6 @@ SIDE_BY_SIDE = {"columns": BRUKER, "nm_per_volt": 50.0}
         (partial(asylum_ramp, order="<"), RAMP, {"rtol": 2e-7}, 0.01),
         (partial(asylum_ramp, order=">"), RAMP, {"rtol": 2e-7}, 0.01),
         (nanonis_ramp, {}, {"rtol": 1e-9}, 1e-6),
-        (bruker_ramp, SIDE_BY_SIDE, {"rtol": 0.0, "atol": 1e-4}, 1e-4),
         (partial(with_units_in_names, "\t", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (partial(with_units_in_names, ";", ","), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         # decimal commas are told from commas that separate
@@ -145,7 +143,7 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
     offset, amplitude, lag = tapping_rows()
     curve = read_curve(saved(tmp_path, write()), **options)
     assert int(np.sum(curve.branch == "approach")) == 120
-    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, bruker_ramp) else 120)
+    assert len(curve.branch) == (240 if options is RAMP or write is nanonis_ramp else 120)
     np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, **precision)
     np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=degrees)
     np.testing.assert_allclose(np.diff(curve.offset_nm[:120]), np.diff(offset), atol=1e-2)
@@ -191,17 +189,13 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
 
 def test_pairs_of_names_are_two_ways_and_numbers_count_below_a_head(tmp_path: Path):
     there, back = tapping_rows(), tapping_rows(retract=True)
-    names = ("Calc_Ramp_{}_nm", "Amplitude_mV_{}", "Phase_{}_deg")
-    both = {
-        name.format(way): numbers
-        for way, rows in (("Ex", there), ("Rt", back))
-        for name, numbers in zip(names, rows, strict=True)
-    }
-    curve = read_curve(saved(tmp_path, separated(both, "\t")), nm_per_volt="1000 +- 20", drive="force")
-    assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 120
-    assert curve.known["nm_per_volt"].error == 20.0
-    np.testing.assert_allclose(given(curve.amplitude), np.concatenate([there[1], back[1]]), atol=1e-6)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), np.concatenate([there[2], back[2]]), atol=1e-6)
+    path = saved(tmp_path, bruker_ramp())
+    for columns in ("", BRUKER):
+        curve = read_curve(path, columns=columns, nm_per_volt="50 +- 1", drive="force")
+        assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 120
+        assert curve.known["nm_per_volt"].error == 1.0
+        np.testing.assert_allclose(given(curve.amplitude), np.concatenate([there[1], back[1]]), atol=1e-4)
+        np.testing.assert_allclose(given(curve.phase_lag_deg), np.concatenate([there[2], back[2]]), atol=1e-4)
     offset, amplitude, lag = there
     path = saved(tmp_path, separated({"a": offset, "b": amplitude, "c": lag}, ";"))
     by_name, by_number = (
@@ -225,19 +219,14 @@ def test_files_that_are_not_read_say_how_to_export(tmp_path: Path, data: bytes, 
         read_curves(saved(tmp_path, data))
 
 
-def test_wrong_column_maps_are_named(tmp_path: Path):
+def test_columns_without_names_are_asked_for_in_pairs(tmp_path: Path):
     path = saved(tmp_path, raw_curve(50).text)
-    cases: Any = (
-        (
-            {"columns": "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"},
-            "=5 has one channel where other columns have OUT/BACK",
-        ),
-        ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
-        ({}, re.escape('say `columns="offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V')),
-    )
-    for options, said in cases:
+    for columns, said in (
+        ("offset_nm=1/2:nm,lockin_amplitude_nm=5:V", "=5 has one channel where other columns have OUT/BACK"),
+        ("", re.escape('say `columns="offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V')),
+    ):
         with pytest.raises(TableError, match=said):
-            read_curves(path, **options)
+            read_curves(path, columns=columns)
 
 
 def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
@@ -250,12 +239,9 @@ def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
 
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
-    asked = 'say `columns="offset_nm=Z:nm,lockin_amplitude_nm=A:nm,phase_lag_deg=P:deg"`'
     path = saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n")
-    with pytest.raises(TableError, match=re.escape(asked)):
-        read_curve(path)
-    without_phase = read_curve(path, columns="lockin_amplitude_nm=A")
-    assert any(f"another channel is, {asked[:24]}" in note for note in without_phase.notes)
+    notes = read_curve(path, columns="lockin_amplitude_nm=A").notes
+    assert any('another channel is, say `columns="offset_nm=Z:nm,' in note for note in notes)
     # names that cannot be printed are quoted
     strange = saved(tmp_path, "offset_nm,lockin_amplit\x1dude_nm,phase_lag_deg\n" + "1,2,3\n" * 9)
     assert read_recording(strange).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
