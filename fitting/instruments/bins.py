@@ -6,8 +6,6 @@ free tip, because the height does. Where the farther free bins scatter about a s
 errors (noise that is not independent from row to row), all errors are multiplied by that.
 """
 
-from collections.abc import Collection
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -47,7 +45,6 @@ def binned(
     free: Bool[np.ndarray, " rows"],
     width_nm: float,
     single: dict[str, float],
-    stated: Collection[str],
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a table, a bin of height each, and whether they stand as they were passed.
 
@@ -59,8 +56,8 @@ def binned(
         branch: "approach" or "retract" of each row.
         free: rows of the free tip.
         width_nm: of a bin; 0: rows of equal height are merged.
-        single: standard error of a single reading, by name.
-        stated: readings whose error that is, and not the scatter; with `width_nm` 0 all.
+        single: standard error of a single reading, by name; what a row of equal heights has for an error, over the
+            root of their number.
     """
     columns: dict[str, list[np.ndarray]] = {}
     in_order = True
@@ -80,7 +77,7 @@ def binned(
         found = {"offset_nm": _means(place, height), "retract": np.full(len(counts), float(name == "retract"))}
         for key, values in readings.items():
             means, error = _means(place, values[rows]), single[key] / np.sqrt(counts)
-            if key not in stated:
+            if width_nm > 0.0:
                 scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
                 # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
                 error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)

@@ -378,12 +378,12 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
         error = float(max(look.level_error for look in looks.values()))
         known.setdefault("free_amplitude_nm", Known(level, "nm", how, error))
         how = measured if noise else "assumed: 1 % of the free amplitude"
-        known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
+        known["amplitude_error_nm"] = Known(noise or 0.01 * level, "nm", how)
     if curve.phase_lag_deg is not None:
         ways = [curve.phase_lag_deg[curve.free & (curve.branch == branch)] for branch in looks]
         scatter = max(float(np.std(np.diff(way)) / np.sqrt(2.0)) if len(way) > 4 else 0.0 for way in ways)
         how = measured if scatter > 0.0 else "assumed: 1 degree"
-        known.setdefault("phase_error_deg", Known(scatter or 1.0, "deg", how))
+        known["phase_error_deg"] = Known(scatter or 1.0, "deg", how)
 
 
 def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
@@ -527,11 +527,9 @@ def zero_of_free_rows(error: float) -> str:
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a curve's table, its bins or the rows as they were read, and if they are in order of time."""
     readings = {"lockin_amplitude_nm": curve.amplitude}
-    known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
     if curve.phase_lag_deg is not None:
-        readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
-    width = curve.bin_nm or 0.0
-    single = {name: float(one.value) for name, one in known.items()}
-    stated = {name for name, one in known.items() if not width or one.origin.startswith("option")}
-    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, single, stated)
+        readings["phase_lag_deg"] = curve.phase_lag_deg
+    errors = {"lockin_amplitude_nm": "amplitude_error_nm", "phase_lag_deg": "phase_error_deg"}
+    single = {name: float(curve.known[errors[name]].value) for name in readings}
+    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm or 0.0, single)
     return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))

@@ -264,14 +264,6 @@ def parse_igor(data: bytes, name: str) -> Recording:
     if side not in {1, 2} or len(labels) != numbers.shape[side]:
         raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
     header = _settings(bytes(wave["note"]), ":")
-    known = known_from(header, "note")
-    phase, said = (number_in(header.get(f"FreeAir{what}", "")) for what in ("Phase", "Amplitude"))
-    if phase is not None:
-        known["free_phase_deg"] = Known(phase[0], "deg", "note: FreeAirPhase")
-    if said is not None and said[0] > 0.0 and (said[0] < 1e-5 or "nm_per_volt" in known):
-        # in volts, or in metres where tiny
-        factor, how = (1e9, "m") if said[0] < 1e-5 else (float(known["nm_per_volt"].value), "V, times AmpInvOLS")
-        known["free_amplitude_nm"] = Known(said[0] * factor, "nm", f"note: FreeAirAmplitude, assumed in {how}")
     units = {label: "deg" if re.match("pha", label, re.IGNORECASE) else "m" for label in labels}
     # Igor counts columns first, and rows from below
     columns = {
@@ -280,7 +272,7 @@ def parse_igor(data: bytes, name: str) -> Recording:
     sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
     size = None if None in sides else (sides[0][0], sides[1][0])  # type: ignore[index]
     kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
-    return Recording(kind, name, (Segment(1, "", columns),), units, known, settings=header, size_m=size)
+    return Recording(kind, name, (Segment(1, "", columns),), units, known_from(header, "note"), (), (), header, size)
 
 
 def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:

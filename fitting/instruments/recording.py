@@ -178,8 +178,6 @@ UNIT_OF = {
     "nm_per_volt": "nm/V",
     "tip_calibration": "",
     "offset_origin_nm": "nm",
-    "amplitude_error_nm": "nm",
-    "phase_error_deg": "deg",
 }
 """Numbers of lever, drive and instrument that a caller may give, with their units."""
 
