@@ -154,7 +154,11 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
 def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
     known = curve.known["free_frequency_khz"]
-    assert (known.value, known.unit, known.origin) == (pytest.approx(90.0, rel=1e-12), "kHz", "note: ThermalFrequency")
+    assert (known.value, known.unit, known.origin) == (
+        pytest.approx(90.0, rel=1e-12),
+        "kHz",
+        "header: ThermalFrequency",
+    )
     lever = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz")
     numbers = [curve.number(key) for key in (*lever, "nm_per_volt")]
     assert numbers == pytest.approx([5.4, 200.0, 90.0, 120.0], rel=1e-12)

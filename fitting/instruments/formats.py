@@ -19,13 +19,10 @@ from afm_jax.words import printable
 from fitting.instruments.recording import (
     UNITS,
     WAY,
-    Known,
     Recording,
     Segment,
     cut_off,
     damaged_as_one_line,
-    known_from,
-    number_in,
     package_for,
     two_ways,
     unit_named,
@@ -63,8 +60,6 @@ def read_recording(path: str | Path) -> Recording:
     parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse_text)
     with damaged_as_one_line(name):
         recording = parse(data, name)
-    if any(np.ndim(v) != 1 for s in recording.segments for v in s.channels.values()):
-        raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
     return recording
@@ -111,7 +106,7 @@ def parse_text(data: bytes, name: str) -> Recording:
         # the height is written once where forward and backward stood at the same heights
         pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
         segments = two_ways(segments, pairs)
-    return Recording(kind, name, segments, units, known_from(header), away, remarks, header)
+    return Recording(kind, name, segments, units, away, remarks, header)
 
 
 def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -179,7 +174,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
     if not segments or segments[-1].curve < announced:
         raise cut_off(name, f"{announced} curves are announced, {segments[-1].curve if segments else 0} there")
     # without an image of the excitation frequency its offset is no frequency
-    return Recording("WSxM curves", name, tuple(segments), units, known_from(header), settings=header)
+    return Recording("WSxM curves", name, tuple(segments), units, settings=header)
 
 
 def _wsxm_header(data: bytes, start: int, name: str) -> tuple[dict[str, str], int]:
@@ -231,20 +226,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     if not parts:
         mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
         raise TableError(f"{name}: holds no curve and no spectrum; {mend}")
-    known = known_from(header)
-    warm = number_in(header.get("Cantilever temperature", ""))
-    if warm is not None and -100.0 < warm[0] < 500.0:
-        origin = "header: Cantilever temperature, assumed in degrees Celsius"
-        known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
-    return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
+    return Recording("NanoSurf .nid", name, segments, units, settings=header)
 
 
 # ---- Igor
 
 
 def parse_igor(data: bytes, name: str) -> Recording:
-    """Read Asylum's binary waves: a column, or an image, for each channel, notes of `key: value`, SI units.
+    """Read ramps in Asylum's binary waves: a column for each channel, notes of `key: value`, SI units.
 
     Raises:
         TableError: if it is damaged, or the package that reads it is missing; the line names the extra.
@@ -259,31 +249,25 @@ def parse_igor(data: bytes, name: str) -> Recording:
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    side = numbers.ndim - 1
-    labels = _igor_labels(data, wave["bin_header"], min(side, 2))
-    if side not in {1, 2} or len(labels) != numbers.shape[side]:
-        raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
+    labels = _igor_labels(data, wave["bin_header"])
+    if numbers.ndim != 2 or len(labels) != numbers.shape[1]:
+        raise TableError(f"{name}: holds no labelled columns of a ramp; energies of images: afm-jax tapping-map")
     header = _settings(bytes(wave["note"]), ":")
     units = {label: "deg" if re.match("pha", label, re.IGNORECASE) else "m" for label in labels}
-    # Igor counts columns first, and rows from below
-    columns = {
-        label: (numbers[..., ::-1, k].T if side == 2 else numbers[:, k].copy()) for k, label in enumerate(labels)
-    }
-    sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
-    size = None if None in sides else (sides[0][0], sides[1][0])  # type: ignore[index]
-    kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
-    return Recording(kind, name, (Segment(1, "", columns),), units, known_from(header, "note"), (), (), header, size)
+    columns = {label: column.copy() for label, column in zip(labels, numbers.T, strict=True)}
+    segments = (Segment(1, "", columns),)
+    return Recording("Igor .ibw ramp", name, segments, units, settings=header)
 
 
-def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
-    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
+def _igor_labels(data: bytes, header: Mapping[str, Any]) -> list[str]:
+    """Return the labels of a wave's columns: texts in fields of 32 bytes, that of all columns first.
 
     What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
     """
-    sizes = [int(size) for size in header.get("dimLabelsSize", [0])]
+    sizes = [int(size) for size in header.get("dimLabelsSize", [0, 0])]
     # the labels of all sides stand in front of the file's end; version 5 is the only one with labels
-    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[side:])
-    fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
+    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[1:])
+    fields = [data[place : place + 32] for place in range(start + 32, start + sizes[1], 32)]
     # UTF-8 since version 7 of Igor
     texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
     return [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
@@ -298,7 +282,7 @@ def _igor_points(data: bytes) -> int:
     return int(announced.max()) if announced.min() >= 0 else len(data) + 1
 
 
-IGOR = (b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02")
-"""What Igor's binary waves begin with: version 5 or 2, in either order of bytes."""
-MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf, **dict.fromkeys(IGOR, parse_igor)}
+MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}
+# Igor's binary waves: version 5 or 2, in either order of bytes
+MARKS |= dict.fromkeys((b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"), parse_igor)
 """Formats by what their files begin with."""

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -52,7 +53,7 @@ class Known:
     Attributes:
         value: in the unit of its key; a word where it is none.
         unit: of a number; empty for a plain one.
-        origin: "header: ...", "note: ...", "option ...", "measured: ..." or "assumed: ...".
+        origin: "header: ...", "option ...", "measured: ..." or "assumed: ...".
         error: its standard error, None where not known.
     """
 
@@ -99,7 +100,6 @@ class Recording:
         source: path as it was given.
         segments: in the order of the file.
         units: unit of every channel, a key of `UNITS` or as the file spells it; empty: the file does not say.
-        known: what the header says, by this package's keys.
         away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
         settings: what the header says, as the file spells it.
@@ -110,11 +110,15 @@ class Recording:
     source: str
     segments: tuple[Segment, ...]
     units: Mapping[str, str]
-    known: dict[str, Known] = field(default_factory=dict)
     away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
     size_m: tuple[float, float] | None = None
+
+    @cached_property
+    def known(self) -> dict[str, Known]:
+        """What the header says, by this package's keys."""
+        return known_from(self.settings)
 
     @property
     def channels(self) -> list[str]:
@@ -149,12 +153,11 @@ _HEADER = {
 own name it stands in its own unit."""
 
 
-def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Known]:
+def known_from(header: Mapping[str, str]) -> dict[str, Known]:
     """Return what the lines of a header say of the measurement, in this package's units.
 
     Args:
         header: texts by the names that the file gives them.
-        where: what the place is called: "header" or "note".
     """
     found = {}
     for key, (own_unit, usual, names) in _HEADER.items():
@@ -164,7 +167,11 @@ def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Kn
                 quantity, factor = UNITS.get(said[1] or (own_unit if name == key else usual), ("", 1.0))
                 if quantity == quantity_of(own_unit):
                     # twelve digits: a change of unit must not add others
-                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"{where}: {name}")
+                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"header: {name}")
+    warm = number_in(header.get("Cantilever temperature", ""))
+    if warm is not None and -100.0 < warm[0] < 500.0:
+        origin = "header: Cantilever temperature, assumed in degrees Celsius"
+        found["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     return found
 
 

@@ -8,7 +8,7 @@ read by the same functions.
 import csv
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -411,8 +411,8 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     return None
 
 
-def read_cells(rows: NumberedLines, source: Source) -> list[list[str]]:
-    """Return the cells of lines, as many in each as in the first, without the spaces and quotation marks around them.
+def read_cells(rows: NumberedLines, source: Source) -> Iterator[list[str]]:
+    """Give the cells of each line, as many in each as in the first, without the spaces and quotation marks around them.
 
     A separator that ends a line begins no cell, and decimal commas become points.
 
@@ -425,12 +425,12 @@ def read_cells(rows: NumberedLines, source: Source) -> list[list[str]]:
     """
     # names may hold commas, and the last row may be cut off
     separator = _separator_of(rows[len(rows) // 2][1])
-    table: list[list[str]] = []
+    width = 0
     for line, text in rows:
         if text.count('"') % 2:
             raise source.fault("a quotation mark is not closed; close or remove it", line=line)
         cells = _cells_of(text, separator)
-        width = len(table[0]) if table else len(cells) - (not cells[-1])
+        width = width or len(cells) - (not cells[-1])
         if len(cells) == width + 1 and not cells[-1]:
             cells.pop()
         if width < 2:
@@ -438,8 +438,7 @@ def read_cells(rows: NumberedLines, source: Source) -> list[list[str]]:
         if len(cells) != width:
             mend = "fill the row up, and write points for decimal commas"
             raise source.fault(f"there are {len(cells)} cells for {width} columns; {mend}", line=line)
-        table.append(cells)
-    return table
+        yield cells
 
 
 def _cells_of(text: str, separator: str) -> list[str]:
@@ -474,11 +473,12 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
     Raises:
         TableError: if names, or a cell, are wrong.
     """
-    names, *body = read_cells(rows, source)
+    table = read_cells(rows, source)
+    names = next(table)
     check_names(names, form, source, line=rows[0][0])
     lines = np.array([line for line, _ in rows[1:]])
     columns = {}
-    for name, cells in zip(names, zip(*body, strict=True), strict=True):
+    for name, cells in zip(names, zip(*table, strict=True), strict=True):
         if name in form.names:
             columns[name] = numbers_of(cells)
             bad = np.isnan(columns[name]) & ~(np.array([not cell for cell in cells]) & form.blanks)
