@@ -52,8 +52,6 @@ def read_recording(path: str | Path) -> Recording:
     """
     name = printable(str(path))
     data = read_bytes(path, "one file")
-    if not data.strip():
-        raise TableError(f"{name}: the file is empty; copy it again from the instrument")
     for marks, what in _NOT_READ.items():
         if any(mark in data[:16] for mark in marks):
             raise TableError(f"{name}: {what}; energies of images: afm-jax tapping-map")

@@ -108,18 +108,14 @@ class SeveralTables:
         return self.tables[0].mass_ng
 
     def __getattr__(self, name: str) -> Any:
-        """Return what each table has a number a row of, for all rows: frequency, amplitude and offset of the drive."""
+        """Return what each table has a number a row of, for all rows; 0 of `no_orbit` where a table does not have it."""
         if name not in _STACKED:
             raise AttributeError(name)
-        return np.concatenate([getattr(table, name) for table in self.tables])
-
-    @property
-    def no_orbit(self) -> Float[np.ndarray, " rows"]:
-        """1 where the tip settled on no single-impact orbit, else 0."""
-        return np.concatenate([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
+        columns = [getattr(table, name) for table in self.tables]
+        return np.concatenate([np.zeros(self.tables[i].rows) if c is None else c for i, c in enumerate(columns)])
 
 
-_STACKED = ("lines", "order", "drive_frequency_khz", "excitation_nm", "offset_nm")
+_STACKED = ("lines", "order", "drive_frequency_khz", "excitation_nm", "offset_nm", "no_orbit")
 _READINGS = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
 """What tells tables apart."""
 _SAME_MASS = 0.01
