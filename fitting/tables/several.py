@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from afm_jax.solve.least_squares import chi2_tail
 from fitting.tables.table import (
@@ -108,7 +108,7 @@ class SeveralTables:
         return self.tables[0].mass_ng
 
     def __getattr__(self, name: str) -> Any:
-        """Return what each table has a number a row of, for all rows; 0 of `no_orbit` where a table does not have it."""
+        """Return what each table has a number a row of, for all rows; 0 of `no_orbit` where a table has none."""
         if name not in _STACKED:
             raise AttributeError(name)
         columns = [getattr(table, name) for table in self.tables]
