@@ -135,11 +135,9 @@ def usual_unit(role: str) -> str:
 
 def _numbered(channel: str, names: list[str]) -> str:
     """Return the channel that is meant: of that name, of the pair of ways that the name is of, else of that number."""
-    first = channel.partition("/")[0].strip()
-    if channel not in names and WAY.search(first) and WAY.sub("", first) in names:
-        return WAY.sub("", first)
-    counted = channel not in names and channel.isdecimal() and 0 < int(channel) <= len(names)
-    return names[int(channel) - 1] if counted else channel
+    of_pair = WAY.sub("", channel.partition("/")[0].strip()) if WAY.search(channel) else ""
+    counted = dict(zip(map(str, range(1, len(names) + 1)), names, strict=True))
+    return next((name for name in (channel, of_pair, counted.get(channel)) if name in names), channel)
 
 
 def _existing(channel: str, recording: Recording) -> str:
@@ -176,8 +174,7 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
             f"write two for each, as {_EXAMPLE}"
         )
     units = {name: recording.units.get(pair[0], "") for name, pair in pairs.items()}
-    away = tuple(name for name, pair in pairs.items() if pair[0] in recording.away)
-    return replace(recording, segments=two_ways(recording.segments, pairs), units=units, away=away)
+    return replace(recording, segments=two_ways(recording.segments, pairs), units=units)
 
 
 def columns_to_paste(recording: Recording, roles: Iterable[str] = tuple(ROLES)) -> str:

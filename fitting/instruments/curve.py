@@ -201,9 +201,6 @@ def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: li
             notes.append(f"{_NO_PHASE}{paste if len(recording.channels) > len(sources) else ''}.")
             continue
         channel = source.channel
-        if role == "offset_nm" and role not in wanted and channel in recording.away:
-            source = replace(source, factor=-1.0)
-            notes.append(f"Sign: {channel} grows away from the sample in this format; the offset is its negative.")
         if not recording.units.get(channel) and not (role in wanted and wanted[role].unit):
             notes.append(f'Unit: {channel} has none; {source.unit} is assumed; else `columns="{role}={channel}:UNIT"`.')
         sources[role] = source

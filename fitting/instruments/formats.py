@@ -88,13 +88,16 @@ def parse_text(data: bytes, name: str) -> Recording:
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]
     header = {pair[0]: re.sub(r"^(\[.*?\])\s*(.*?)\s*$", r"\2 \1", pair[1]) for pair in pairs if len(pair) == 2}
     columns, units = _columns([row for row in rows if row[0] > start], name)
-    kind, away, remarks = ("Nanonis text", ("Z rel", "Z"), ()) if start else ("separated text", (), ())
+    kind, away, remarks = ("Nanonis text", {"Z rel", "Z"}, []) if start else ("separated text", set(), [])
     runs = np.zeros(len(next(iter(columns.values()), ())))
     if any("neaspec" in comment.lower() for _, comment in comments):
-        kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
-        remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
+        kind, away, runs = "neaSNOM text", {"Z"}, columns.get("Run", runs)
+        remarks.append("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.")
         columns = {title: numbers for title, numbers in columns.items() if re.fullmatch(r"Z|[MO]\d[AP]", title)}
         units = {title: {"Z": "m", "A": "nm", "P": "rad"}[title[-1]] for title in columns}
+    for title in [title for title in columns if title.removeprefix(BACK) in away]:
+        columns[title] = -columns[title]
+        remarks.append(f"Sign: {title} grows away from the sample in this format; the offset is its negative.")
     segments = tuple(
         Segment(number, "", {title: numbers[runs == run] for title, numbers in columns.items()})
         for number, run in enumerate(dict.fromkeys(runs.tolist()), start=1)
@@ -104,7 +107,7 @@ def parse_text(data: bytes, name: str) -> Recording:
         # the height is written once where forward and backward stood at the same heights
         pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
         segments = two_ways(segments, pairs)
-    return Recording(kind, name, segments, units, away, remarks, header)
+    return Recording(kind, name, segments, units, tuple(remarks), header)
 
 
 def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:

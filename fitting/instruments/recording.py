@@ -98,9 +98,8 @@ class Recording:
     Attributes:
         format: its name: "neaSNOM text", "WSxM curves", ...
         source: path as it was given.
-        segments: in the order of the file.
+        segments: in the order of the file; heights grow towards the tip.
         units: unit of every channel, a key of `UNITS` or as the file spells it; empty: the file does not say.
-        away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
         settings: what the header says, as the file spells it.
         size_m: height and width of images, or None.
@@ -110,7 +109,6 @@ class Recording:
     source: str
     segments: tuple[Segment, ...]
     units: Mapping[str, str]
-    away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
     size_m: tuple[float, float] | None = None
