@@ -79,11 +79,36 @@ def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows) -> BranchLook:
         free = offset <= offset[first] - 0.1 * (offset[first] - offset[0])
     change = _change(offset, values)
     jump = _jump(values[free], lag[free]) if change is None else None
+    if jump is None:
+        free &= np.arange(len(values)) < _plateau_end(values[free], lag[free])
     rows = values[free]
     noise = _scatter(rows) if len(rows) >= _FEWEST else float("nan")
     error = float(np.std(rows) / np.sqrt(len(rows)))
     mask = free[np.argsort(order, kind="stable")]
     return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
+
+
+def _plateau_end(values: Rows, lag: Rows) -> int:
+    """Return how many rows, the farthest first, are of the free tip: until blocks of a 20th leave the farthest ones."""
+    until = len(values)
+    size = max(until // 20, _FEWEST)
+    blocks = until // size
+    if blocks < 4:
+        return until
+    first = max(blocks // 4, 1)
+    # blocks of the free tip may differ by 0.005 of the amplitude, and by a degree
+    for column, flat in ((values, 0.005 * abs(float(np.median(values)))), (lag, 1.0)):
+        far = float(np.median(column[: first * size]))
+        noise = 5.0 * _scatter(column[: first * size])
+        middles = np.median(column[: blocks * size].reshape(blocks, size), axis=1)
+        away = np.abs(middles - far) > max(flat, noise / np.sqrt(size))
+        # one block that departs may be a spike
+        leaves = np.flatnonzero(away[first:] & np.append(away[first + 1 :], True))
+        until = min([until, *((first + leaves[:1]) * size).tolist()])
+        # of the last block single rows may be in contact
+        while until > len(values) // 2 and abs(column[until - 1] - far) > max(flat, noise):
+            until -= 1
+    return until
 
 
 def _change(offset: Rows, values: Rows) -> float | None:

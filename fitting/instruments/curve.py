@@ -155,7 +155,6 @@ def read_curves(
     recording = read_recording(path)
     if any(name.startswith("Frequency") for name in recording.channels):
         raise TableError(f"{recording.source}: holds a spectrum or a resonance sweep; `afm-jax calibrate` fits it")
-    stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
     refuse_other_modes(recording.settings, recording.source, recording.channels)
     known = recording.known | {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
@@ -172,18 +171,12 @@ def read_curves(
     curves = []
     for number, ways in enumerate(joined, start=1):
         curve = _joined(recording, ways, sources, notes, curve=number, curves=len(joined), known=dict(known))
-        if _runs_away(curve):
-            # branches were named by the heights where the file does not name them
-            named = curve.branch if stated else np.where(curve.branch == "approach", "retract", "approach")
-            curve = replace(curve, offset_nm=-curve.offset_nm, branch=named, notes=(*curve.notes, _TURNED))
         curves.append(_binning(_judged(curve, of_slope=of_slope, stated_sense=sense), bin_nm))
     return curves
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
 _NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
-_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
-_TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
 _Columns = dict[str, np.ndarray]
 
 
@@ -208,7 +201,7 @@ def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: li
 
 
 def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator[tuple[Any, str, _Columns]]:
-    """Give which curve, branch and columns of every ramp; where no branch is stated the heights tell it.
+    """Give which curve, branch (empty if it is not stated) and columns of every ramp.
 
     An approach and a retract, the one after the other, are a curve then. Heights that jump about are one branch.
     """
@@ -217,9 +210,8 @@ def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator
         offset = columns["offset_nm"]
         turns = [] if segment.branch else turns_of(offset)
         for number, (first, last) in enumerate(pairwise([0, *turns, len(offset)])):
-            direction = "approach" if offset[last - 1] >= offset[first] else "retract"
             part = {role: numbers[first:last] for role, numbers in columns.items()}
-            yield (segment.curve, number // 2), segment.branch or direction, part
+            yield (segment.curve, number // 2), segment.branch, part
 
 
 def _joined(
@@ -229,20 +221,34 @@ def _joined(
     notes: list[str],
     **known: Any,
 ) -> MeasuredCurve:
-    """Return approach and retract, the one after the other, as a curve."""
+    """Return approach and retract, the one after the other, as a curve whose heights grow towards the sample."""
     columns = {role: np.concatenate([parts[role] for _, parts in ways]) for role in sources}
-    amplitude, phase = columns["lockin_amplitude_nm"], columns.get("phase_lag_deg")
-    inverted = amplitude[np.argmax(np.abs(amplitude))] < 0.0
+    offset, amplitude, phase = columns["offset_nm"], columns["lockin_amplitude_nm"], columns.get("phase_lag_deg")
+    said = list(notes)
+    if amplitude[np.argmax(np.abs(amplitude))] < 0.0:
+        amplitude = -amplitude
+        said.append("Sign: the amplitude is negative (an inverted channel), and its sign was reversed.")
+    rows = [len(parts["offset_nm"]) for _, parts in ways]
+    ramps = [np.split(column, np.cumsum(rows)[:-1]) for column in (offset, amplitude, np.zeros(len(offset)))]
+    touches = any(look_at(*ramp).slope for ramp in zip(*ramps, strict=True))
+    by_height = amplitude[np.argsort(offset, kind="stable")]
+    some = max(len(offset) // 20, 1)
+    # the far end has less than 0.95 of the amplitude near the sample
+    turn = -1.0 if not touches and np.median(by_height[:some]) < 0.95 * np.median(by_height[-some:]) else 1.0
+    if turn < 0.0:
+        lowest = "the amplitude falls where the heights are lowest"
+        said.append(f"Direction: {lowest}: they grow away from the sample and were turned.")
+    named = ["approach" if turn * (ramp[-1] - ramp[0]) >= 0.0 else "retract" for ramp in ramps[0]]
     return MeasuredCurve(
         source=recording.source,
         format=recording.format,
-        branch=np.concatenate([np.full(len(parts["offset_nm"]), name) for name, parts in ways]),
-        offset_nm=columns["offset_nm"],
-        amplitude=-amplitude if inverted else amplitude,
+        branch=np.repeat([name or direction for (name, _), direction in zip(ways, named, strict=True)], rows),
+        offset_nm=turn * offset,
+        amplitude=amplitude,
         amplitude_unit="V" if quantity_of(sources["lockin_amplitude_nm"].unit) == "voltage" else "nm",
         phase_lag_deg=None if phase is None else np.unwrap(phase, period=360.0),
         free=np.zeros(len(amplitude), dtype=bool),
-        notes=(*notes, _INVERTED) if inverted else tuple(notes),
+        notes=tuple(said),
         **known,
     )
 
@@ -268,14 +274,6 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
                 f"{where}: is no number below 1e9; give its unit, remove the row, or export the file again"
             )
     return {role: numbers[:rows] for role, numbers in columns.items()}
-
-
-def _runs_away(curve: MeasuredCurve) -> bool:
-    """Say whether heights grow away from the sample: the amplitude is smaller at their lower end."""
-    amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
-    some = max(len(amplitude) // 20, 1)
-    # heights run the other way where the far end has less than 0.95 of the amplitude near the sample
-    return bool(np.median(amplitude[:some]) < 0.95 * np.median(amplitude[-some:]))
 
 
 def _as_named(curve: MeasuredCurve) -> list[bool]:
