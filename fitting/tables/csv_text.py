@@ -347,12 +347,10 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{quoted(text)} is no known setting; the key is {key}, as in '{setting.line}'")
     # Spreadsheets fill every line up with commas.
     value = match["value"].rstrip(",; \t").strip()
-    if value in setting.choices:
-        return value, None
-    if setting.choices:
+    if setting.choices and value not in setting.choices:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
-    if setting.none and value == "none":
-        return None, None
+    if setting.choices or (setting.none and value == "none"):
+        return (value if setting.choices else None), None
     number, error = value_and_error(value, f"'{setting.line}', with a decimal point and without the unit")
     if setting.error == ("always" if error is None else "never"):
         raise ValueError(f"{key} {'needs its' if error is None else 'takes no'} standard error; write '{setting.line}'")

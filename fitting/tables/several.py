@@ -59,8 +59,8 @@ class SeveralTables:
         known: dict[tuple[bytes, ...], str] = {}
         for table, label in zip(self.tables, self.labels, strict=True):
             # noise alone makes no two measurements alike
-            columns = [getattr(table, name) for name in _READINGS]
-            other = known.setdefault(tuple(b"" if one is None else one.tobytes() for one in columns), label)
+            readings = tuple(np.array(getattr(table, name), dtype=float).tobytes() for name in _READINGS)
+            other = known.setdefault(readings, label)
             if other is not label:
                 raise ValueError(f"{label} holds the same readings as {other}; give each table once")
 
