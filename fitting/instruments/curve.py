@@ -276,12 +276,6 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
     return {role: numbers[:rows] for role, numbers in columns.items()}
 
 
-def _as_named(curve: MeasuredCurve) -> list[bool]:
-    """Say of every branch whether its heights rise in an approach, or fall in a retract."""
-    ways = ways_of(curve.offset_nm, curve.branch)
-    return [bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways.items()]
-
-
 def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
     """Return a curve with the width of its table's bins: as given, or the usual one where heights ask for bins."""
     repeated, back = faults_of_order(curve.offset_nm, curve.branch)
@@ -527,4 +521,7 @@ def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     errors = {"lockin_amplitude_nm": "amplitude_error_nm", "phase_lag_deg": "phase_error_deg"}
     single = {name: float(curve.known[errors[name]].value) for name in readings}
     rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm or 0.0, single)
-    return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))
+    # of rows as they were read heights rise in an approach, and fall in a retract
+    ways = ways_of(curve.offset_nm, curve.branch).items()
+    as_named = all(bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways)
+    return rows, in_order and (curve.bin_nm is not None or as_named)

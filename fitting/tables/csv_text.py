@@ -8,7 +8,7 @@ read by the same functions.
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -424,10 +424,10 @@ def read_cells(rows: NumberedLines, source: Source) -> Iterator[list[str]]:
     # names may hold commas, and the last row may be cut off
     separator = _separator_of(rows[len(rows) // 2][1])
     width = 0
-    for line, text in rows:
+    all_cells = _cells_of((text for _, text in rows), separator)
+    for (line, text), cells in zip(rows, all_cells, strict=False):
         if text.count('"') % 2:
             raise source.fault("a quotation mark is not closed; close or remove it", line=line)
-        cells = _cells_of(text, separator)
         width = width or len(cells) - (not cells[-1])
         if len(cells) == width + 1 and not cells[-1]:
             cells.pop()
@@ -439,17 +439,17 @@ def read_cells(rows: NumberedLines, source: Source) -> Iterator[list[str]]:
         yield cells
 
 
-def _cells_of(text: str, separator: str) -> list[str]:
+def _cells_of(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
     # several spaces may stand between columns
-    row = next(csv.reader([text.strip(" ")], delimiter=separator, skipinitialspace=True))
-    cells = [cell.strip() for cell in row]
-    return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+    for row in csv.reader((line.strip(" ") for line in lines), delimiter=separator, skipinitialspace=True):
+        cells = [cell.strip() for cell in row]
+        yield [cell.replace(",", ".") if "," in cell and DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
 
 
 def _separator_of(row: str) -> str:
     """Return what separates numbers: commas only where they are no decimal commas."""
     for sign in ",\t; ":
-        cells = [cell for cell in _cells_of(row, sign) if cell]
+        cells = [cell for cell in next(_cells_of([row], sign)) if cell]
         if len(cells) > 1 and all(map(NUMBER.fullmatch, cells)):
             return sign
     return next((sign for sign in "\t;, " if sign in row.strip()), ",")
