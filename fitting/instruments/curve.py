@@ -221,7 +221,7 @@ def _joined(
     notes: list[str],
     **known: Any,
 ) -> MeasuredCurve:
-    """Return approach and retract, the one after the other, as a curve whose heights grow towards the sample."""
+    """Return approach and retract, the one after the other, as a curve whose heights grow towards the tip."""
     columns = {role: np.concatenate([parts[role] for _, parts in ways]) for role in sources}
     offset, amplitude, phase = columns["offset_nm"], columns["lockin_amplitude_nm"], columns.get("phase_lag_deg")
     said = list(notes)
