@@ -1,13 +1,12 @@
 """Bins of height: curves whose heights repeat or are not in order, as rows that a table can hold.
 
-A bin's row is the mean of the readings in it. Its error is their scatter about the line through the means, pooled
-with that of the neighbouring bins, over the root of their number: in contact readings scatter more than those of the
-free tip, because the height does. Where the farther free bins scatter about a straight line in time by more than their
-errors (noise that is not independent from row to row), all errors are multiplied by that.
+A bin's row is the mean of the readings in it. Its error is their scatter about the line through the means, pooled with
+that of the neighbouring bins, over the root of their number: in contact readings scatter more than those of the free
+tip, because the height does.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 Rows = Float[np.ndarray, " rows"]
 Bins = Float[np.ndarray, " bins"]
@@ -42,7 +41,6 @@ def binned(
     offset_nm: Rows,
     readings: dict[str, Rows],
     branch: np.ndarray,
-    free: Bool[np.ndarray, " rows"],
     width_nm: float,
     single: dict[str, float],
 ) -> tuple[dict[str, np.ndarray], bool]:
@@ -54,7 +52,6 @@ def binned(
         offset_nm: heights.
         readings: what was read there, by name.
         branch: "approach" or "retract" of each row.
-        free: rows of the free tip.
         width_nm: of a bin; 0: rows of equal height are merged.
         single: standard error of a single reading, by name; what a row of equal heights has for an error, over the
             root of their number.
@@ -71,16 +68,13 @@ def binned(
         spread = np.sqrt(np.maximum(_means(place, (rows - time[place]) ** 2.0), 0.0))
         # rows of a bin that are spread over more than a tenth of the branch are of several ramps
         in_order &= bool(np.median(spread) <= 0.1 * len(rows) + 1.0)
-        whole = np.bincount(place, free[rows]) == counts
-        # the nearer half of the free rows may feel the sample already
-        whole &= np.cumsum(whole) <= 0.5 * whole.sum()
         found = {"offset_nm": _means(place, height), "retract": np.full(len(counts), float(name == "retract"))}
         for key, values in readings.items():
             means, error = _means(place, values[rows]), single[key] / np.sqrt(counts)
             if width_nm > 0.0:
                 scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
                 # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
-                error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)
+                error = np.where(scatter > 0.0, scatter, error)
             # `phase_lag_error_deg` of `phase_lag_deg`
             stem, _, unit = key.rpartition("_")
             found |= {key: means, f"{stem}_error_{unit}": error}
@@ -103,14 +97,3 @@ def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
         np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, np.bincount(place) - 1.0)
     )
     return np.sqrt(pooled / np.maximum(freedom, 1.0))
-
-
-def _excess(values: Bins, errors: Bins, time: Bins) -> float:
-    """Return by how much free bins scatter more about a straight line in time than their errors say, 1 at least."""
-    known = errors > 0.0
-    if known.sum() < _ROWS:
-        return 1.0
-    values, weights = values[known], 1.0 / errors[known]
-    place = (time[known] - time[known].mean()) / max(float(np.ptp(time)), 1.0)
-    misfit = (values - np.polyval(np.polyfit(place, values, 1, w=weights), place)) * weights
-    return max(1.0, float(np.sqrt(np.sum(misfit**2) / (known.sum() - 2))))

@@ -520,7 +520,7 @@ def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
         readings["phase_lag_deg"] = curve.phase_lag_deg
     errors = {"lockin_amplitude_nm": "amplitude_error_nm", "phase_lag_deg": "phase_error_deg"}
     single = {name: float(curve.known[errors[name]].value) for name in readings}
-    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm or 0.0, single)
+    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.bin_nm or 0.0, single)
     # of rows as they were read heights rise in an approach, and fall in a retract
     ways = ways_of(curve.offset_nm, curve.branch).items()
     as_named = all(bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways)
