@@ -173,17 +173,8 @@ def known_from(header: Mapping[str, str]) -> dict[str, Known]:
     return found
 
 
-UNIT_OF = {
-    "drive_frequency_khz": "kHz",
-    "free_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "free_phase_deg": "deg",
-    "nm_per_volt": "nm/V",
-    "tip_calibration": "",
-    "offset_origin_nm": "nm",
-}
+UNIT_OF = {key: unit for key, (unit, _, _) in _HEADER.items() if key != "averages"}
+UNIT_OF |= {"free_phase_deg": "deg", "tip_calibration": "", "offset_origin_nm": "nm"}
 """Numbers of lever, drive and instrument that a caller may give, with their units."""
 
 
