@@ -521,8 +521,7 @@ def as_table(given: TableLike, *, noise: float | None = None, quality_factor: An
         given = read_table(Path(os.fspath(given)), noise)
     if quality_factor is None:
         return given
-    none = quality_factor == "none"
-    value, error = (None, None) if none else given_value("quality_factor", quality_factor)
+    value, error = (None, None) if quality_factor == "none" else given_value("quality_factor", quality_factor)
     return replace(given, quality_factor=value, quality_factor_error=error)
 
 
