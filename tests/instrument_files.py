@@ -51,7 +51,7 @@ def asylum_ramp(*, order: str = "<") -> bytes:
     offset, amplitude, lag = (np.concatenate(pair) for pair in zip(there, back, strict=True))
     columns = {"ZSnsr": 1e-9 * offset, "Amp": 1e-9 * amplitude, "Phase": lag, "Defl": 1e-9 * 0.01 * offset}
     note = "SpringConstant: 5.4\rInvOLS: 1.1e-07\rAmpInvOLS: 1.2e-07\rDriveFrequency: 90000\rThermalFrequency: 90000\r"
-    note += "ThermalQ: 200\rFreeAirAmplitude: 0.33333\rFreeAirPhase: 90\rIndexes: 0,119,239\rDirection: NaN,1,-1\r"
+    note += "ThermalQ: 200\r"
     return igor_wave(columns, note, order=order)
 
 

@@ -37,7 +37,7 @@ class ReadingOptions:
     """How an instrument's file becomes rows of a table, as `fitting.read_curves` takes it.
 
     Attributes:
-        columns: the channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as
+        columns: the channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg), as
             offset_nm=Z:um,lockin_amplitude_nm=Amp:V. Files without a head have numbered channels; approach and retract
             in two channels are APPROACH/RETRACT: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.
         drive: what drives the tip: a piezo at its base (assumed without this option), or a force (photothermal,
@@ -47,8 +47,6 @@ class ReadingOptions:
         bin_nm: width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of
             five rows where heights repeat or are not in order.
         offset_origin_nm: height (growing towards the tip) at which the sample is at the tip's rest position.
-        amplitude_error_nm: standard error of every amplitude; else the scatter of the free rows.
-        phase_error_deg: standard error of every phase; else the scatter of the free rows.
     """
 
     columns: Annotated[str, "COLUMN=CHANNEL[:UNIT][:FACTOR],..."] = ""
@@ -56,8 +54,6 @@ class ReadingOptions:
     nm_per_volt: Sensitivity | None = None
     bin_nm: float | None = None
     offset_origin_nm: Quantity | None = None
-    amplitude_error_nm: Quantity | None = None
-    phase_error_deg: Quantity | None = None
 
 
 def curves_of_a_file(

@@ -27,7 +27,7 @@ SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 34
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
 EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
 OPTIONS: dict[str, Any] = {
-    "columns": "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
+    "columns": "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
     "drive": "force",
     "nm_per_volt": "slope",
     "spring_constant_n_per_m": "44 +- 4",

@@ -1,15 +1,12 @@
 """Bins of height: curves whose heights repeat or are not in order, as rows that a table can hold.
 
-A bin's row is the mean of the readings in it. Its error is their scatter about a straight line over the height, pooled
-with that of the neighbouring bins, over the root of their number: in contact readings scatter more than those of the
-free tip, because the height does. Where the farther free bins scatter about a straight line in time by more than their
-errors (noise that is not independent from row to row), all errors are multiplied by that.
+A bin's row is the mean of the readings in it. Its error is their scatter about the line through the means, pooled with
+that of the neighbouring bins, over the root of their number: in contact readings scatter more than those of the free
+tip, because the height does.
 """
 
-from collections.abc import Collection
-
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 Rows = Float[np.ndarray, " rows"]
 Bins = Float[np.ndarray, " bins"]
@@ -44,10 +41,8 @@ def binned(
     offset_nm: Rows,
     readings: dict[str, Rows],
     branch: np.ndarray,
-    free: Bool[np.ndarray, " rows"],
     width_nm: float,
     single: dict[str, float],
-    stated: Collection[str],
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a table, a bin of height each, and whether they stand as they were passed.
 
@@ -57,10 +52,9 @@ def binned(
         offset_nm: heights.
         readings: what was read there, by name.
         branch: "approach" or "retract" of each row.
-        free: rows of the free tip.
         width_nm: of a bin; 0: rows of equal height are merged.
-        single: standard error of a single reading, by name.
-        stated: readings whose error that is, and not the scatter; with `width_nm` 0 all.
+        single: standard error of a single reading, by name; what a row of equal heights has for an error, over the
+            root of their number.
     """
     columns: dict[str, list[np.ndarray]] = {}
     in_order = True
@@ -74,16 +68,13 @@ def binned(
         spread = np.sqrt(np.maximum(_means(place, (rows - time[place]) ** 2.0), 0.0))
         # rows of a bin that are spread over more than a tenth of the branch are of several ramps
         in_order &= bool(np.median(spread) <= 0.1 * len(rows) + 1.0)
-        whole = np.bincount(place, free[rows]) == counts
-        # the nearer half of the free rows may feel the sample already
-        whole &= np.cumsum(whole) <= 0.5 * whole.sum()
         found = {"offset_nm": _means(place, height), "retract": np.full(len(counts), float(name == "retract"))}
         for key, values in readings.items():
             means, error = _means(place, values[rows]), single[key] / np.sqrt(counts)
-            if key not in stated:
+            if width_nm > 0.0:
                 scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
                 # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
-                error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)
+                error = np.where(scatter > 0.0, scatter, error)
             # `phase_lag_error_deg` of `phase_lag_deg`
             stem, _, unit = key.rpartition("_")
             found |= {key: means, f"{stem}_error_{unit}": error}
@@ -98,34 +89,11 @@ def _means(place: Places, values: Rows) -> Bins:
 
 
 def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
-    """Return the scatter of single readings about a line over the height, in each bin and its neighbours."""
-    # bins of few rows are taken together
-    group, held = [0], 0
-    for count in np.bincount(place).tolist():
-        full = held >= _ROWS
-        group.append(group[-1] + full)
-        held = count + (0 if full else held)
-    last = group[-1] - (held < _ROWS and group[-1] > 0)
-    groups = np.minimum(group[1:], last)
-    of_row = groups[place]
-    rows = np.bincount(of_row).astype(float)
-    x, y = (numbers - _means(of_row, numbers)[of_row] for numbers in (height, values))
-    # a column of one height, or of one number, has no slope
-    width = _means(of_row, x * x)
-    slope = np.where(width > 0.0, _means(of_row, x * y) / np.where(width > 0.0, width, 1.0), 0.0)
-    squares = np.bincount(of_row, (y - slope[of_row] * x) ** 2)
-    freedom = np.maximum(rows - 2.0, 0.0)
+    """Return the scatter of single readings about the line through the bins' means, in each bin and its neighbours."""
+    line = np.interp(height, _means(place, height), _means(place, values))
+    squares = np.bincount(place, (values - line) ** 2)
     window = np.ones(2 * _NEIGHBOURS + 1)
-    pooled, free = (np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, freedom))
-    return np.sqrt(pooled / np.maximum(free, 1.0))[groups]
-
-
-def _excess(values: Bins, errors: Bins, time: Bins) -> float:
-    """Return by how much free bins scatter more about a straight line in time than their errors say, 1 at least."""
-    known = errors > 0.0
-    if known.sum() < _ROWS:
-        return 1.0
-    values, weights = values[known], 1.0 / errors[known]
-    place = (time[known] - time[known].mean()) / max(float(np.ptp(time)), 1.0)
-    misfit = (values - np.polyval(np.polyfit(place, values, 1, w=weights), place)) * weights
-    return max(1.0, float(np.sqrt(np.sum(misfit**2) / (known.sum() - 2))))
+    pooled, freedom = (
+        np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, np.bincount(place) - 1.0)
+    )
+    return np.sqrt(pooled / np.maximum(freedom, 1.0))

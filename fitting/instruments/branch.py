@@ -19,15 +19,15 @@ class ContactSlope(NamedTuple):
         error: standard error of it by the scatter about the line.
         bend: standard error of it because the line may be bent too little to be seen: a tenth of the change of a
             parabola's slope along it, and of that change's error.
-        from_nm: height of its first row.
-        to_nm: height of its last row, the nearest to the sample.
+        offsets_nm: heights of its rows, the nearest to the sample last.
+        level: mean amplitude of its rows.
     """
 
     value: float
     error: float
     bend: float
-    from_nm: float
-    to_nm: float
+    offsets_nm: Rows
+    level: float
 
 
 class BranchLook(NamedTuple):
@@ -54,70 +54,59 @@ class BranchLook(NamedTuple):
     change: float | None = None
 
 
-def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> BranchLook:
+def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows) -> BranchLook:
     """Return the free level, its noise and jumps, contact and slope of one branch.
 
     Args:
         offset_nm: heights, growing towards the tip.
         amplitude: in any unit, positive.
-        lag_deg: of the phase, with any zero; it leaves that of the free tip before the amplitude does.
+        lag_deg: of the phase, with any zero, or zeros; it leaves that of the free tip before the amplitude does.
     """
     order = np.argsort(offset_nm, kind="stable")
-    offset, values = offset_nm[order], amplitude[order]
+    offset, values, lag = offset_nm[order], amplitude[order], lag_deg[order]
     high = values[values > 0.7 * values.max()]
     level = float(np.median(high))
     scatter = 1.48 * float(np.median(np.abs(high - level)))
     first, last = _contact(values, level, scatter)
-    touching = slice(first, last)
     # of a curve that goes deep the slope is read between 0.1 and 0.9 of the free amplitude
-    engaged = values[touching] > 0.1 * level
-    near, fallen = offset[touching][engaged], values[touching][engaged]
-    slope = steepest_part(near, fallen, deep=bool(values.min() < 0.5 * level))
-    onset = None
-    if slope is not None:
-        # where the line through the steepest part meets the free level
-        part = (near >= slope.from_nm) & (near <= slope.to_nm)
-        onset = float(near[part].mean() + (level - fallen[part].mean()) / slope.value)
-    edge = offset[first] if first < last else np.inf
-    # the farthest row even where all are in contact
-    free = offset <= edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
+    engaged = first + np.flatnonzero(values[first:last] > 0.1 * level)
+    slope = steepest_part(offset[engaged], values[engaged], deep=bool(values.min() < 0.5 * level))
+    # where the line through the steepest part meets the free level
+    onset = None if slope is None else float(slope.offsets_nm.mean() + (level - slope.level) / slope.value)
+    free = np.ones(len(values), dtype=bool)
+    if first < last:
+        # the farthest row even where all are in contact
+        free = offset <= offset[first] - 0.1 * (offset[first] - offset[0])
     change = _change(offset, values)
-    lag = None if lag_deg is None else lag_deg[order][free]
-    jump = _jump(values[free], lag) if change is None else None
+    jump = _jump(values[free], lag[free]) if change is None else None
     if jump is None:
-        free &= np.arange(len(values)) < _plateau_end(values[free], lag)
+        free &= np.arange(len(values)) < _plateau_end(values[free], lag[free])
     rows = values[free]
-    mask = np.zeros(len(values), dtype=bool)
-    mask[order] = free
     noise = _scatter(rows) if len(rows) >= _FEWEST else float("nan")
     error = float(np.std(rows) / np.sqrt(len(rows)))
+    mask = free[np.argsort(order, kind="stable")]
     return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
 
 
-def _plateau_end(values: Rows, lag: Rows | None) -> int:
+def _plateau_end(values: Rows, lag: Rows) -> int:
     """Return how many rows, the farthest first, are of the free tip: until blocks of a 20th leave the farthest ones."""
-    rows = len(values)
-    size = max(rows // 20, _FEWEST)
-    ends = [size * k for k in range(1, rows // size + 1)]
-    if len(ends) < 4:
-        return rows
-    until = rows
+    until = len(values)
+    size = max(until // 20, _FEWEST)
+    blocks = until // size
+    if blocks < 4:
+        return until
+    first = max(blocks // 4, 1)
     # blocks of the free tip may differ by 0.005 of the amplitude, and by a degree
     for column, flat in ((values, 0.005 * abs(float(np.median(values)))), (lag, 1.0)):
-        if column is None:
-            continue
-        middles = np.array([np.median(column[end - size : end]) for end in ends])
-        first = max(len(ends) // 4, 1)
-        far = float(np.median(column[: ends[first - 1]]))
-        allowed = max(flat, 4.0 * 1.25 * _scatter(column[: ends[first - 1]]) / np.sqrt(size))
-        away = np.abs(middles - far) > allowed
+        far = float(np.median(column[: first * size]))
+        noise = 5.0 * _scatter(column[: first * size])
+        middles = np.median(column[: blocks * size].reshape(blocks, size), axis=1)
+        away = np.abs(middles - far) > max(flat, noise / np.sqrt(size))
         # one block that departs may be a spike
         leaves = np.flatnonzero(away[first:] & np.append(away[first + 1 :], True))
-        if leaves.size:
-            until = min(until, ends[first + int(leaves[0])] - size)
+        until = min([until, *((first + leaves[:1]) * size).tolist()])
         # of the last block single rows may be in contact
-        limit = max(flat, 5.0 * _scatter(column[: ends[first - 1]]))
-        while until > rows // 2 and abs(column[until - 1] - far) > limit:
+        while until > len(values) // 2 and abs(column[until - 1] - far) > max(flat, noise):
             until -= 1
     return until
 
@@ -159,8 +148,7 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
 
     A curve that first falls slowly (attraction) and then by 1 nm per nm (a hard sample) tells the scale of its
     amplitude by the second part only. Lines are laid through all windows of a nm or more; of those as steep as the
-    steepest within their errors the one nearest to the sample is taken, longer where its slope is known to worse than
-    3 % and the rows before it lie on the same line.
+    steepest within their errors the one nearest to the sample is taken.
 
     Args:
         offset: heights, rising.
@@ -174,26 +162,23 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     # 1 nm at least
     length = max(1.0, 5.0 * float(np.median(np.diff(offset))))
     starts = np.searchsorted(offset, offset - length, side="left").tolist()
-    lines = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
-    windows = [(a, b, line) for a, b, line in lines if line is not None]
-    # windows that the far end cuts off count only where there is no whole one
-    whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
+    # windows that the far end cuts off are left out
+    ends = [(a, b) for b, a in enumerate(starts, start=1) if b - a > 3 and offset[b - 1] - offset[0] >= length]
+    windows = [(a, b, line) for a, b in ends if (line := _line(offset[a:b], values[a:b]))]
     chosen = _line(offset, values)
     first, last, usual = 0, rows, 0.0
-    if whole:
-        slopes, errors, scatters = np.array([line for *_, line in whole]).T
+    if windows:
+        slopes, errors, scatters = np.array([line for *_, line in windows]).T
         # settled is a window that scatters about its line by at most three times what most do, or 6 % of its fall: of a
         # jump a line leaves 17 %
         usual = float(np.median(scatters))
         settled = scatters <= np.maximum(3.0 * usual, 0.06 * length * np.abs(slopes)) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
-        start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
-        start = _straight_from(offset[: end + 1], values[: end + 1], start)
-        part = _line(offset[start : end + 1], values[start : end + 1])
+        nearest = windows[int(np.flatnonzero(alike)[-1])]
         # with a plateau the line through all rows has less than 0.8 of the slope of the steepest part
-        if not (deep and part is not None and chosen is not None and chosen[0] < 0.8 * part[0]):
-            chosen, first, last = part, start, end + 1
+        if not (deep and chosen is not None and chosen[0] < 0.8 * nearest[2][0]):
+            first, last, chosen = nearest
     # a slope differs from 0 by four standard errors
     if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
@@ -201,21 +186,7 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     # few rows may lie on a line by chance
     error = max(chosen[1], usual / float(np.linalg.norm(part - part.mean())))
     bend = 0.1 * float(np.hypot(*_change_of_slope(part, values[first:last])))
-    return ContactSlope(chosen[0], error, bend, float(part[0]), float(part[-1]))
-
-
-def _straight_from(offset: Rows, values: Rows, first: int) -> int:
-    """Return from which row on the slope is known to 3 %, as far as the rows up to the last lie on a line."""
-    step = max(len(offset) - first, 4) // 4
-    while first > 0:
-        line = _line(offset[first:], values[first:])
-        trial = max(first - step, 0)
-        known = line is not None and line[1] < 0.03 * abs(line[0])
-        change, error = _change_of_slope(offset[trial:], values[trial:])
-        if known or len(offset) - trial < 6 or abs(change) > 2.0 * error + 1e-12 * abs(values[-1]):
-            break
-        first = trial
-    return first
+    return ContactSlope(chosen[0], error, bend, part, float(values[first:last].mean()))
 
 
 def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:
@@ -238,7 +209,7 @@ def _line(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]
     return slope, scatter / float(np.sqrt(width)), scatter
 
 
-def _jump(values: Rows, lag: Rows | None) -> tuple[float, float] | None:
+def _jump(values: Rows, lag: Rows) -> tuple[float, float] | None:
     """Return the levels on both sides of the split of the rows whose means differ most, if that is a jump.
 
     A tip that comes into contact goes on losing amplitude, and its lag changes, too.
@@ -246,23 +217,18 @@ def _jump(values: Rows, lag: Rows | None) -> tuple[float, float] | None:
     rows = len(values)
     if rows < 2 * _FEWEST:
         return None
-    sums = np.cumsum(values)
     counts = np.arange(_FEWEST, rows - _FEWEST + 1)
-    before = sums[counts - 1] / counts
-    after = (sums[-1] - sums[counts - 1]) / (rows - counts)
+    sums = np.cumsum(values)[counts - 1]
+    before, after = sums / counts, (values.sum() - sums) / (rows - counts)
     most = int(np.argmax(np.abs(after - before)))
+    low, high, split = float(before[most]), float(after[most]), int(counts[most])
     single = float(np.median(np.abs(np.diff(values)))) / 0.954
-    error = single * np.sqrt(1.0 / counts[most] + 1.0 / (rows - counts[most]))
-    low, high = float(before[most]), float(after[most])
-    behind = values[counts[most] :]
-    falls = len(behind) * abs(float(np.polyfit(np.arange(len(behind)), behind, 1)[0]))
-    turn = 0.0
-    if lag is not None:
-        turn = float(np.percentile(np.abs(lag[counts[most] :] - np.median(lag[: counts[most]])), 75.0))
+    error = single * np.sqrt(1.0 / split + 1.0 / (rows - split))
+    falls = (rows - split) * abs(float(np.polyfit(np.arange(rows - split), values[split:], 1)[0]))
     # a change of the amplitude with one of the lag by 3 degrees is that of first contact
-    if falls > 0.5 * abs(high - low) or turn > 3.0:
-        return None
+    turn = float(np.percentile(np.abs(lag[split:] - np.median(lag[:split])), 75.0))
     # a drift spreads over the rows, a jump happens between two of them
-    near = values[max(counts[most] - 10, 0) : counts[most]].mean(), values[counts[most] : counts[most] + 10].mean()
-    sudden = abs(near[1] - near[0]) > 0.5 * abs(high - low)
-    return (low, high) if abs(high - low) > max(JUMP * abs(low), 6.0 * error) and sudden else None
+    sudden = abs(values[split : split + 10].mean() - values[max(split - 10, 0) : split].mean())
+    if falls > 0.5 * abs(high - low) or turn > 3.0 or sudden <= 0.5 * abs(high - low):
+        return None
+    return (low, high) if abs(high - low) > max(JUMP * abs(low), 6.0 * error) else None

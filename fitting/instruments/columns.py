@@ -23,14 +23,9 @@ ROLES = {
         ("angle",),
         ("phase_lag.*", "m1p", "phase?(_.*)?", r"(lock-?in[_ ])?pha(?![a-z]*[ _]?2).*"),
     ),
-    "deflection_nm": (("length", "voltage", "force"), ("defl.*", "normal force")),
 }
 """What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case); channels
 of a second mode, Amplitude2 and Phase2, are none."""
-
-
-CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
-"""What a curve needs."""
 
 
 @dataclass(frozen=True)
@@ -59,21 +54,26 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
     """
     found = {}
     for part in filter(None, text.split(",")):
-        column, sign, source = (piece.strip() for piece in part.partition("="))
-        channel, *rest = (piece.strip() for piece in source.split(":"))
-        units = [unit_named(piece) for piece in rest if not NUMBER.fullmatch(piece)]
-        factors = [float(piece) for piece in rest if NUMBER.fullmatch(piece)]
-        if not sign or not channel or len(units) > 1 or len(factors) > 1 or 0.0 in factors:
+        match = _PART.fullmatch(part.strip())
+        if match is None or float(match["factor"] or 1.0) == 0.0:
             raise ValueError(f"'{part.strip()}' is no COLUMN=CHANNEL[:UNIT][:FACTOR]; write offset_nm=Z:um:-1")
+        column, unit = match["column"], unit_named(match["unit"] or "")
         if column not in ROLES:
             raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
         if column in found:
             raise ValueError(f"the column `{column}` is there twice; approach and retract are {column}=OUT/BACK")
-        if units and quantity_of(units[0]) not in ROLES[column][0]:
+        if unit and quantity_of(unit) not in ROLES[column][0]:
             known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
-            raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
-        found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else None)
+            raise ValueError(f"`{unit}` is no unit of {column}; write one of {known}")
+        found[column] = ColumnSource(match["channel"], unit, float(match["factor"]) if match["factor"] else None)
     return found
+
+
+_PART = re.compile(
+    rf"(?P<column>[^=]*?)\s*=\s*(?P<channel>[^:]+?)\s*(:\s*(?P<unit>(?!{NUMBER.pattern}\s*$)[^:]+?)\s*)?"
+    rf"(:\s*(?P<factor>{NUMBER.pattern}))?",
+    re.ASCII,
+)
 
 
 def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSource]) -> ColumnSource | None:
@@ -90,10 +90,10 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
     (quantities, patterns), names, source = ROLES[role], recording.channels, wanted.get(role)
     if source is None:
         taken = {_numbered(other.channel, names) for other in wanted.values()}
-        ranked = [n for pattern in patterns for n in names if re.fullmatch(pattern, n, re.IGNORECASE | re.DOTALL)]
-        units = {n: recording.units.get(n, "") for n in ranked if n not in taken}
-        suited = [n for n, unit in units.items() if quantity_of(unit) in quantities]
-        suited += [n for n, unit in units.items() if not unit]
+        free = [name for name in names if name not in taken]
+        ranked = [n for pattern in patterns for n in free if re.fullmatch(pattern, n, re.IGNORECASE | re.DOTALL)]
+        suited = [n for n in ranked if quantity_of(recording.units.get(n, "")) in quantities]
+        suited += [n for n in ranked if not recording.units.get(n)]
         if not suited:
             return None
         source = ColumnSource(suited[0])
@@ -108,7 +108,7 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
 
 
 def needed_channel(
-    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE
+    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = tuple(ROLES)
 ) -> ColumnSource:
     """Return the channel that becomes a column, as `channel_of`.
 
@@ -135,11 +135,9 @@ def usual_unit(role: str) -> str:
 
 def _numbered(channel: str, names: list[str]) -> str:
     """Return the channel that is meant: of that name, of the pair of ways that the name is of, else of that number."""
-    first = channel.partition("/")[0].strip()
-    if channel not in names and WAY.search(first) and WAY.sub("", first) in names:
-        return WAY.sub("", first)
-    counted = channel not in names and channel.isdecimal() and 0 < int(channel) <= len(names)
-    return names[int(channel) - 1] if counted else channel
+    of_pair = WAY.sub("", channel.partition("/")[0].strip()) if WAY.search(channel) else ""
+    counted = dict(zip(map(str, range(1, len(names) + 1)), names, strict=True))
+    return next((name for name in (channel, of_pair, counted.get(channel)) if name in names), channel)
 
 
 def _existing(channel: str, recording: Recording) -> str:
@@ -176,11 +174,10 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
             f"write two for each, as {_EXAMPLE}"
         )
     units = {name: recording.units.get(pair[0], "") for name, pair in pairs.items()}
-    away = tuple(name for name, pair in pairs.items() if pair[0] in recording.away)
-    return replace(recording, segments=two_ways(recording.segments, pairs), units=units, away=away)
+    return replace(recording, segments=two_ways(recording.segments, pairs), units=units)
 
 
-def columns_to_paste(recording: Recording, roles: Iterable[str] = CURVE) -> str:
+def columns_to_paste(recording: Recording, roles: Iterable[str] = tuple(ROLES)) -> str:
     """Return what to write for channels whose names do not tell what they are, made from the file's own channels."""
     names = recording.channels
     if names == [str(k + 1) for k in range(8)]:
@@ -201,18 +198,15 @@ def turns_of(height: Float[np.ndarray, " rows"]) -> list[int]:
     # a sample that turns goes back by 0.3 of the range of heights
     least = 0.3 * float(np.ptp(height)) if len(height) else 0.0
     turns: list[int] = []
-    rising, extreme = 0, 0
-    low = high = 0
+    rising, low, high = 0, 0, 0
     for row, value in enumerate(height.tolist()):
         low = row if value < height[low] else low
         high = row if value > height[high] else high
-        if not rising:
-            rising = 1 if value - height[low] > least else -1 if height[high] - value > least else 0
-            extreme = row
-        elif rising * (value - height[extreme]) > 0.0:
-            extreme = row
-        elif rising * (height[extreme] - value) > least:
-            turns.append(extreme + 1)
-            rising, extreme = -rising, row
+        if rising <= 0 and value - height[low] > least:
+            turns += [low + 1] if rising else []
+            rising, high = 1, row
+        elif rising >= 0 and height[high] - value > least:
+            turns += [high + 1] if rising else []
+            rising, low = -1, row
     # with fewer than 8 rows between two turns heights jump to and fro, and are no ramps
     return turns if len(height) >= 8 * (len(turns) + 1) else []

@@ -30,7 +30,7 @@ from fitting.instruments.columns import (
     turns_of,
 )
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, free_lag_deg, sense_of_phase
+from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, sense_of_phase
 from fitting.instruments.recording import (
     ASSUMED_RESONANCE,
     UNIT_OF,
@@ -66,11 +66,9 @@ class MeasuredCurve(JudgedResult):
         curves: how many the file holds.
         branch: "approach" or "retract" of each row.
         offset_nm: height of the sample over the rest position; relative if there is no `offset_origin_nm` in `known`.
-        amplitude: lock-in amplitude in `amplitude_unit`, or None.
+        amplitude: lock-in amplitude in `amplitude_unit`.
         amplitude_unit: "nm", or "V" where the sensitivity is not known.
         phase_lag_deg: lag behind the drive, or None.
-        deflection: mean deflection in `deflection_unit`, or None.
-        deflection_unit: "nm", "V" or "nN".
         free: rows of the free tip.
         bin_nm: width of the bins of height that a table of it has (0: equal heights are merged), None: rows as read.
         slope: change of the amplitude per nm of height in contact, in `amplitude_unit`, and its error; or None.
@@ -86,11 +84,9 @@ class MeasuredCurve(JudgedResult):
     curves: int
     branch: np.ndarray
     offset_nm: Float[np.ndarray, " rows"]
-    amplitude: Float[np.ndarray, " rows"] | None = None
+    amplitude: Float[np.ndarray, " rows"]
     amplitude_unit: str = "nm"
     phase_lag_deg: Float[np.ndarray, " rows"] | None = None
-    deflection: Float[np.ndarray, " rows"] | None = None
-    deflection_unit: str = "nm"
     free: Bool[np.ndarray, " rows"]
     bin_nm: float | None = None
     slope: tuple[float, float] | None = None
@@ -153,25 +149,21 @@ def read_curves(
         ValueError: if an option is impossible.
     """
     check_parameter("bin_nm", bin_nm, "not negative", optional=True)
-    of_slope = {"nm_per_volt": None} if numbers.get("nm_per_volt") == "slope" else {}
-    known = {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
-    known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
+    of_slope = numbers.get("nm_per_volt") == "slope"
+    given = given_numbers(numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS)
     wanted = parse_columns(columns)
     recording = read_recording(path)
-    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
-    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
-        what = "thermal spectrum" if spectrum else "resonance sweep"
-        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
-    stated = any(segment.branch for segment in recording.segments)
+    if any(name.startswith("Frequency") for name in recording.channels):
+        raise TableError(f"{recording.source}: holds a spectrum or a resonance sweep; `afm-jax calibrate` fits it")
     recording = laid_out(recording, wanted)
-    known = recording.known | known
+    refuse_other_modes(recording.settings, recording.source, recording.channels)
+    known = recording.known | {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
+    known |= given
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
         known["drive_frequency_khz"] = replace(known["free_frequency_khz"], origin=ASSUMED_RESONANCE, error=None)
     notes = list(recording.remarks)
     sources = _sources(recording, wanted, notes)
-    if "lockin_amplitude_nm" in sources:
-        refuse_other_modes(recording.settings, recording.source, recording.channels)
     factor = wanted["phase_lag_deg"].factor if "phase_lag_deg" in wanted else None
     sense = phase_sense or ("" if factor is None else "lag")
     by_curve = groupby(_ways(recording, sources), key=lambda way: way[0])
@@ -179,65 +171,47 @@ def read_curves(
     curves = []
     for number, ways in enumerate(joined, start=1):
         curve = _joined(recording, ways, sources, notes, curve=number, curves=len(joined), known=dict(known))
-        if _runs_away(curve):
-            curve = replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, _TURNED))
-        if not stated and not any(_as_named(curve)):
-            curve = replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
-        curves.append(_binning(_judged(curve, of_slope=bool(of_slope), stated_sense=sense), bin_nm))
+        curves.append(_binning(_judged(curve, of_slope=of_slope, stated_sense=sense), bin_nm))
     return curves
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
+_NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
+_Columns = dict[str, np.ndarray]
 
 
 def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:
     """Return the channels that become columns; notes say what was assumed and what is missing.
 
     Raises:
-        TableError: if there is no height.
+        TableError: if there is no height, or no amplitude.
     """
     sources = {}
     for role in ROLES:
-        source = (needed_channel if role == "offset_nm" else channel_of)(recording, role, wanted)
+        source = (channel_of if role == "phase_lag_deg" else needed_channel)(recording, role, wanted)
         if source is None:
+            paste = f"; if another channel is, {columns_to_paste(recording)}"
+            notes.append(f"{_NO_PHASE}{paste if len(recording.channels) > len(sources) else ''}.")
             continue
         channel = source.channel
-        if role == "offset_nm" and role not in wanted and channel in recording.away:
-            source = replace(source, factor=-1.0)
-            notes.append(f"Sign: {channel} grows away from the sample in this format; the offset is its negative.")
         if not recording.units.get(channel) and not (role in wanted and wanted[role].unit):
             notes.append(f'Unit: {channel} has none; {source.unit} is assumed; else `columns="{role}={channel}:UNIT"`.')
         sources[role] = source
-    missing = next((role for role in _NO if role not in sources), None)
-    if missing is not None:
-        paste = f"; if another channel is, {columns_to_paste(recording)}"
-        notes.append(f"{_NO[missing]}{paste if len(recording.channels) > len(sources) else ''}.")
     return sources
 
 
-_NO = {
-    "lockin_amplitude_nm": "There is no lock-in amplitude",
-    "phase_lag_deg": "There is no phase, so that the energy of a tap has an upper bound only",
-}
-_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
-_Columns = dict[str, np.ndarray]
-
-
 def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator[tuple[Any, str, _Columns]]:
-    """Give which curve, branch and columns of every ramp; where no branch is stated the heights tell it.
+    """Give which curve, branch (empty if it is not stated) and columns of every ramp.
 
     An approach and a retract, the one after the other, are a curve then. Heights that jump about are one branch.
     """
     for segment in recording.segments:
         columns = _converted(recording, segment, sources)
-        if segment.branch:
-            yield segment.curve, segment.branch, columns
-            continue
         offset = columns["offset_nm"]
-        for number, (first, last) in enumerate(pairwise([0, *turns_of(offset), len(offset)])):
-            branch = "approach" if offset[last - 1] >= offset[first] else "retract"
+        turns = [] if segment.branch else turns_of(offset)
+        for number, (first, last) in enumerate(pairwise([0, *turns, len(offset)])):
             part = {role: numbers[first:last] for role, numbers in columns.items()}
-            yield (segment.curve, number // 2), branch, part
+            yield (segment.curve, number // 2), segment.branch, part
 
 
 def _joined(
@@ -247,24 +221,34 @@ def _joined(
     notes: list[str],
     **known: Any,
 ) -> MeasuredCurve:
-    """Return approach and retract, the one after the other, as a curve."""
-    scales = {"length": "nm", "voltage": "V", "force": "nN"}
-    units = {role: scales.get(quantity_of(source.unit), "") for role, source in sources.items()}
+    """Return approach and retract, the one after the other, as a curve whose heights grow towards the tip."""
     columns = {role: np.concatenate([parts[role] for _, parts in ways]) for role in sources}
-    amplitude, phase = columns.get("lockin_amplitude_nm"), columns.get("phase_lag_deg")
-    inverted = amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0
+    offset, amplitude, phase = columns["offset_nm"], columns["lockin_amplitude_nm"], columns.get("phase_lag_deg")
+    said = list(notes)
+    if amplitude[np.argmax(np.abs(amplitude))] < 0.0:
+        amplitude = -amplitude
+        said.append("Sign: the amplitude is negative (an inverted channel), and its sign was reversed.")
+    rows = [len(parts["offset_nm"]) for _, parts in ways]
+    ramps = [np.split(column, np.cumsum(rows)[:-1]) for column in (offset, amplitude, np.zeros(len(offset)))]
+    touches = any(look_at(*ramp).slope for ramp in zip(*ramps, strict=True))
+    by_height = amplitude[np.argsort(offset, kind="stable")]
+    some = max(len(offset) // 20, 1)
+    # the far end has less than 0.95 of the amplitude near the sample
+    turn = -1.0 if not touches and np.median(by_height[:some]) < 0.95 * np.median(by_height[-some:]) else 1.0
+    if turn < 0.0:
+        lowest = "the amplitude falls where the heights are lowest"
+        said.append(f"Direction: {lowest}: they grow away from the sample and were turned.")
+    named = ["approach" if turn * (ramp[-1] - ramp[0]) >= 0.0 else "retract" for ramp in ramps[0]]
     return MeasuredCurve(
         source=recording.source,
         format=recording.format,
-        branch=np.concatenate([np.full(len(parts["offset_nm"]), name) for name, parts in ways]),
-        offset_nm=columns["offset_nm"],
-        amplitude=-amplitude if amplitude is not None and inverted else amplitude,
-        amplitude_unit=units.get("lockin_amplitude_nm", "nm"),
+        branch=np.repeat([name or direction for (name, _), direction in zip(ways, named, strict=True)], rows),
+        offset_nm=turn * offset,
+        amplitude=amplitude,
+        amplitude_unit="V" if quantity_of(sources["lockin_amplitude_nm"].unit) == "voltage" else "nm",
         phase_lag_deg=None if phase is None else np.unwrap(phase, period=360.0),
-        deflection=columns.get("deflection_nm"),
-        deflection_unit=units.get("deflection_nm", "nm"),
-        free=np.zeros(len(columns["offset_nm"]), dtype=bool),
-        notes=(*notes, _INVERTED) if inverted else tuple(notes),
+        free=np.zeros(len(amplitude), dtype=bool),
+        notes=tuple(said),
         **known,
     )
 
@@ -275,41 +259,21 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
     Raises:
         TableError: if a number is none, or impossible.
     """
-    where = f"{recording.source}, curve {segment.curve}"
-    raw = {role: segment.channels[source.channel] for role, source in sources.items()}
-    # rows at the end that hold nothing, or zeros alone, are the padding of a shorter way
-    held = np.flatnonzero(np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in raw.values()], axis=0))
     columns = {}
+    with np.errstate(over="ignore", invalid="ignore"):
+        for role, source in sources.items():
+            columns[role] = segment.channels[source.channel] * (UNITS[source.unit][1] * (source.factor or 1.0))
+    # rows at the end that hold nothing, or zeros alone, are the padding of a shorter way
+    held = np.flatnonzero(np.any([~np.isnan(numbers) & (numbers != 0.0) for numbers in columns.values()], axis=0))
+    rows = held[-1] + 1 if held.size else None
     for role, source in sources.items():
-        with np.errstate(over="ignore", invalid="ignore"):
-            numbers = raw[role] * (UNITS[source.unit][1] * (source.factor or 1.0))
-        columns[role] = numbers[: held[-1] + 1] if held.size else numbers
-        bad = np.flatnonzero(~(np.abs(columns[role]) < 1e9))
+        bad = np.flatnonzero(~(np.abs(columns[role][:rows]) < 1e9))
         if bad.size:
-            what = "beyond 1e9; give its unit" if np.isfinite(raw[role][bad[0]]) else "not a number; remove the row"
+            where = f"{recording.source}, curve {segment.curve}, row {bad[0] + 1}, channel {source.channel}"
             raise TableError(
-                f"{where}, row {bad[0] + 1}, channel {source.channel}: is {what}, or export the file again"
+                f"{where}: is no number below 1e9; give its unit, remove the row, or export the file again"
             )
-    return columns
-
-
-def _runs_away(curve: MeasuredCurve) -> bool:
-    """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
-    if curve.amplitude is None or any(look.slope is not None for look in _looks(curve).values()):
-        return False
-    amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
-    some = max(len(amplitude) // 20, 1)
-    # heights run the other way where the far end has less than 0.95 of the amplitude near the sample
-    return bool(np.median(amplitude[:some]) < 0.95 * np.median(amplitude[-some:]))
-
-
-def _as_named(curve: MeasuredCurve) -> list[bool]:
-    """Say of every branch whether its heights rise in an approach, or fall in a retract."""
-    ways = ways_of(curve.offset_nm, curve.branch)
-    return [bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways.items()]
-
-
-_TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
+    return {role: numbers[:rows] for role, numbers in columns.items()}
 
 
 def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
@@ -326,15 +290,13 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
 
 def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
-    if curve.amplitude is None:
-        return curve
     known, looks, notes = curve.known, _looks(curve), list(curve.notes)
     slope = _mean_slope(looks) if of_slope else None
     if slope is not None:
         # with this scale the amplitude falls by 1 nm per nm in contact
         scale = 1.0 / abs(slope[0])
-        found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
-        parts = " and ".join(f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found)
+        found = [(branch, look.slope.offsets_nm) for branch, look in looks.items() if look.slope is not None]
+        parts = " and ".join(f"{branch} from {at[0]:.2f} to {at[-1]:.2f} nm" for branch, at in found)
         how = f"measured: slope of the steepest settled part ({parts}), assumed to be 1 nm per nm (a hard sample)"
         known["nm_per_volt"] = Known(scale, f"nm/{curve.amplitude_unit}", how, scale * slope[1] / abs(slope[0]))
     if "nm_per_volt" in known and (slope is not None or curve.amplitude_unit == "V"):
@@ -357,13 +319,11 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    offset = curve.offset_nm
-    amplitude = np.asarray(curve.amplitude)
-    lag = curve.phase_lag_deg
     looks = {}
+    lag = np.zeros(len(curve.offset_nm)) if curve.phase_lag_deg is None else curve.phase_lag_deg
     for branch in dict.fromkeys(curve.branch.tolist()):
         here = curve.branch == branch
-        looks[branch] = look_at(offset[here], amplitude[here], None if lag is None else lag[here])
+        looks[branch] = look_at(curve.offset_nm[here], curve.amplitude[here], lag[here])
     return looks
 
 
@@ -403,17 +363,16 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
     noise = max((look.noise for look in looks.values() if look.noise > 0.0), default=0.0)
     measured = "measured: scatter of the free rows"
     if curve.amplitude_unit == "nm":
-        if not any(look.jump for look in looks.values()):
-            how = f"measured: median of {curve.free.sum()} free rows"
-            error = max(v.level_error for v in looks.values())
-            known.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
+        how = f"measured: median of {curve.free.sum()} free rows"
+        error = float(max(look.level_error for look in looks.values()))
+        known.setdefault("free_amplitude_nm", Known(level, "nm", how, error))
         how = measured if noise else "assumed: 1 % of the free amplitude"
-        known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
+        known["amplitude_error_nm"] = Known(noise or 0.01 * level, "nm", how)
     if curve.phase_lag_deg is not None:
         ways = [curve.phase_lag_deg[curve.free & (curve.branch == branch)] for branch in looks]
         scatter = max(float(np.std(np.diff(way)) / np.sqrt(2.0)) if len(way) > 4 else 0.0 for way in ways)
         how = measured if scatter > 0.0 else "assumed: 1 degree"
-        known.setdefault("phase_error_deg", Known(scatter or 1.0, "deg", how))
+        known["phase_error_deg"] = Known(scatter or 1.0, "deg", how)
 
 
 def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
@@ -453,15 +412,11 @@ def _add_phase(
         notes.append("Zero: the phase has the instrument's own zero; free frequency and Q would determine it.")
         return SENSES.get(stated, 1.0) * phase
     readings = _phase_readings(curve, looks)
+    readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
-    readings.refuse_radians(curve.source, 'say `columns="phase_lag_deg=CHANNEL:rad"`')
-    s = readings.frequency_ratio[0]
-    quality = readings.quality_factor
-    either = np.array([1.0, -1.0])
-    of_ratio = free_lag_deg(readings.drive, s * (1.0 + readings.frequency_error * either), quality)
-    of_quality = free_lag_deg(readings.drive, s, quality * (1.0 + readings.quality_error * either))
-    error = float(np.linalg.norm([max(scatter, 0.01), 0.5 * np.ptp(of_ratio), 0.5 * np.ptp(of_quality)]))
+    by_instrument = [float(other.free_lag_deg[0]) - lag for other in readings.disturbed]
+    error = float(np.linalg.norm([max(scatter, 0.01), *by_instrument]))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
     sense = sense_of_phase(readings, stated)
     known["phase_zero_deg"] = Known(sense.zero_deg, "deg", how, error)
@@ -483,7 +438,7 @@ def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Ph
         frequency_error=errors[0],
         quality_factor=value["quality_factor"],
         quality_error=errors[1],
-        ratio=np.asarray(curve.amplitude) / level,
+        ratio=curve.amplitude / level,
         ratio_error=value.get("amplitude_error_nm", 0.01 * level) / level * ones,
         phase_deg=np.asarray(curve.phase_lag_deg),
         phase_error_deg=value["phase_error_deg"] * ones,
@@ -517,9 +472,6 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
         TableError: if something is missing, naming the options that give it, or the curve must not be used.
     """
     where, known = f"{curve.source}, curve {curve.curve}", curve.known
-    if curve.amplitude is None:
-        why = next(note for note in curve.notes if note.startswith(_NO["lockin_amplitude_nm"]))
-        raise TableError(f"{where}: it gives no table. {why}")
     if curve.reasons:
         raise TableError(f"{where}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
@@ -563,12 +515,13 @@ def zero_of_free_rows(error: float) -> str:
 
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a curve's table, its bins or the rows as they were read, and if they are in order of time."""
-    readings = {"lockin_amplitude_nm": np.asarray(curve.amplitude)}
-    known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
+    readings = {"lockin_amplitude_nm": curve.amplitude}
     if curve.phase_lag_deg is not None:
-        readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
-    width = curve.bin_nm or 0.0
-    single = {name: float(one.value) for name, one in known.items()}
-    stated = {name for name, one in known.items() if not width or one.origin.startswith("option")}
-    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, single, stated)
-    return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))
+        readings["phase_lag_deg"] = curve.phase_lag_deg
+    errors = {"lockin_amplitude_nm": "amplitude_error_nm", "phase_lag_deg": "phase_error_deg"}
+    single = {name: float(curve.known[errors[name]].value) for name in readings}
+    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.bin_nm or 0.0, single)
+    # of rows as they were read heights rise in an approach, and fall in a retract
+    ways = ways_of(curve.offset_nm, curve.branch).items()
+    as_named = all(bool(way[-1] >= way[0]) == (name == "approach") for name, way in ways)
+    return rows, in_order and (curve.bin_nm is not None or as_named)

@@ -9,7 +9,6 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +19,22 @@ from afm_jax.words import printable
 from fitting.instruments.recording import (
     UNITS,
     WAY,
-    Known,
     Recording,
     Segment,
     cut_off,
     damaged_as_one_line,
-    known_from,
-    number_in,
     package_for,
     two_ways,
     unit_named,
 )
 from fitting.tables.csv_text import (
-    DECIMAL_COMMA,
     NUMBER,
     NumberedLines,
+    Source,
     TableError,
-    cells_of,
+    numbers_of,
     read_bytes,
+    read_cells,
     split_lines,
     text_of,
 )
@@ -55,16 +52,12 @@ def read_recording(path: str | Path) -> Recording:
     """
     name = printable(str(path))
     data = read_bytes(path, "one file")
-    if not data.strip():
-        raise TableError(f"{name}: the file is empty; copy it again from the instrument")
     for marks, what in _NOT_READ.items():
         if any(mark in data[:16] for mark in marks):
             raise TableError(f"{name}: {what}; energies of images: afm-jax tapping-map")
     parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse_text)
     with damaged_as_one_line(name):
         recording = parse(data, name)
-    if any(np.ndim(v) != 1 for s in recording.segments for v in s.channels.values()):
-        raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
     return recording
@@ -95,28 +88,26 @@ def parse_text(data: bytes, name: str) -> Recording:
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]
     header = {pair[0]: re.sub(r"^(\[.*?\])\s*(.*?)\s*$", r"\2 \1", pair[1]) for pair in pairs if len(pair) == 2}
     columns, units = _columns([row for row in rows if row[0] > start], name)
-    count = len(next(iter(columns.values()), ()))
-    kind, away, remarks = ("Nanonis text", ("Z rel", "Z"), ()) if start else ("separated text", (), ())
-    runs = np.zeros(count)
+    kind, away, remarks = ("Nanonis text", {"Z rel", "Z"}, []) if start else ("separated text", set(), [])
+    runs = np.zeros(len(next(iter(columns.values()), ())))
     if any("neaspec" in comment.lower() for _, comment in comments):
-        kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
-        remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
-        pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [count]
-        declared = int(np.prod([int(pixel) for pixel in pixels[:3]]))
-        if count % max(declared, 1) or count < declared:
-            raise cut_off(name, f"the header announces {declared} rows, but {count} are there")
+        kind, away, runs = "neaSNOM text", {"Z"}, columns.get("Run", runs)
+        remarks.append("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.")
         columns = {title: numbers for title, numbers in columns.items() if re.fullmatch(r"Z|[MO]\d[AP]", title)}
         units = {title: {"Z": "m", "A": "nm", "P": "rad"}[title[-1]] for title in columns}
-    segments = [
+    for title in [title for title in columns if title.removeprefix(BACK) in away]:
+        columns[title] = -columns[title]
+        remarks.append(f"Sign: {title} grows away from the sample in this format; the offset is its negative.")
+    segments = tuple(
         Segment(number, "", {title: numbers[runs == run] for title, numbers in columns.items()})
         for number, run in enumerate(dict.fromkeys(runs.tolist()), start=1)
-    ]
-    back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
+    )
+    back = {title.removeprefix(BACK): title for title in columns if title.startswith(BACK)}
     if back:
         # the height is written once where forward and backward stood at the same heights
         pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
         segments = two_ways(segments, pairs)
-    return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
+    return Recording(kind, name, segments, units, tuple(remarks), header)
 
 
 def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -125,62 +116,35 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     Raises:
         TableError: if a row has another number of cells than the first.
     """
-    # the last row may be cut off
-    separator = _separator_of(rows[len(rows) // 2][1]) if rows else ","
-    # a tab that ends a row is a blank cell where the first row ends without
-    ending = "\t" if separator == "\t" and not rows[0][1].endswith("\t") else ""
-    body = [[_with_point(cell, separator) for cell in cells_of(line + ending, separator)] for _, line in rows]
-    titles = body[0] if rows else []
-    if rows and (len(titles) < 2 or (separator == " " and not all(map(NUMBER.fullmatch, titles)))):
-        raise TableError(
-            f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
-        )
-    odd = next((k for k, cells in enumerate(body) if len(cells) != len(titles)), None)
-    if odd is not None:
-        raise cut_off(f"{name}, line {rows[odd][0]}", f"there are {len(body[odd])} cells for {len(titles)} columns")
+    if not rows:
+        return {}, {}
+    titles, *body = read_cells(rows, Source(name))
     if any(map(NUMBER.fullmatch, titles)):
-        titles = [str(k + 1) for k in range(len(titles))]
-    else:
-        titles = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)]
-        body = body[1:]
-        ways = [WAY.search(title) for title in titles]
-        back = ["[bwd] " if way and way[1] == "Rt" else "" for way in ways]
-        titles = [mark + WAY.sub("", title) for mark, title in zip(back, titles, strict=True)]
-    named = [_name_and_unit(title) for title in titles]
-    units = {plain.replace("[bwd]", "").strip(): unit for plain, unit in named}
-    numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
-    numbers = numbers.reshape(len(body), len(titles))
-    columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
-    return columns, units
+        titles, body = [str(number) for number, _ in enumerate(titles, start=1)], [titles, *body]
+    named = [name_and_unit(printable(title) or f"column {number}") for number, title in enumerate(titles, start=1)]
+    columns = {title: numbers_of(cells) for (title, _), cells in zip(named, zip(*body, strict=True), strict=False)}
+    return columns, {title.removeprefix(BACK): unit for title, unit in named}
 
 
-def _name_and_unit(text: str) -> tuple[str, str]:
-    """Return the name and the unit of a column such as 'Amp (V)', 'Z [nm]', 'Z/nm' or 'phase_deg'.
+def name_and_unit(title: str) -> tuple[str, str]:
+    """Return the name of a column, behind `BACK` of the way back, and its unit.
 
-    >>> _name_and_unit("Amp (V)"), _name_and_unit("Z/µm"), _name_and_unit("height_nm"), _name_and_unit("Z")
-    (('Amp', 'V'), ('Z', 'um'), ('height_nm', 'nm'), ('Z', ''))
+    >>> name_and_unit("Amp (V)"), name_and_unit("Z/µm"), name_and_unit("height_Rt_nm"), name_and_unit("Z")
+    (('Amp', 'V'), ('Z', 'um'), ('[bwd] height_nm', 'nm'), ('Z', ''))
     """
-    match = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]]*)[\])]", text.strip())
-    if match:
-        return match[1], unit_named(match[2])
-    for sign in "/_":
-        name, found, unit = text.strip().rpartition(sign)
-        if found and unit_named(unit) in UNITS:
-            return (name if sign == "/" else text.strip()), unit_named(unit)
-    return text.strip(), ""
+    text = re.sub(rf"\s*\[bwd\]|{WAY.pattern}", "", title).strip()
+    mark = BACK if re.search(r"\[bwd\]|_Rt(?=_|$)", title) else ""
+    in_brackets = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]]*)[\])]", text)
+    if in_brackets:
+        return mark + in_brackets[1], unit_named(in_brackets[2])
+    ending = re.fullmatch(r"(.*)([/_])([^/_]*)", text)
+    if ending and unit_named(ending[3]) in UNITS:
+        return mark + (ending[1] if ending[2] == "/" else text), unit_named(ending[3])
+    return mark + text, ""
 
 
-def _separator_of(row: str) -> str:
-    """Return what separates numbers: commas only where they are no decimal commas."""
-    for sign in "\t; ":
-        cells = [_with_point(cell, sign) for cell in cells_of(row, sign) if cell]
-        if len(cells) > 1 and all(map(NUMBER.fullmatch, cells)):
-            return sign
-    return next((sign for sign in "\t;," if sign in row), " ")
-
-
-def _with_point(cell: str, separator: str) -> str:
-    return cell.replace(",", ".") if separator != "," and DECIMAL_COMMA.fullmatch(cell) else cell
+BACK = "[bwd] "
+"""What the name of a channel of the way back begins with."""
 
 
 # ---- WSxM and NanoSurf
@@ -211,7 +175,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
     if not segments or segments[-1].curve < announced:
         raise cut_off(name, f"{announced} curves are announced, {segments[-1].curve if segments else 0} there")
     # without an image of the excitation frequency its offset is no frequency
-    return Recording("WSxM curves", name, tuple(segments), units, known_from(header), settings=header)
+    return Recording("WSxM curves", name, tuple(segments), units, settings=header)
 
 
 def _wsxm_header(data: bytes, start: int, name: str) -> tuple[dict[str, str], int]:
@@ -263,20 +227,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     if not parts:
         mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
         raise TableError(f"{name}: holds no curve and no spectrum; {mend}")
-    known = known_from(header)
-    warm = number_in(header.get("Cantilever temperature", ""))
-    if warm is not None and -100.0 < warm[0] < 500.0:
-        origin = "header: Cantilever temperature, assumed in degrees Celsius"
-        known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
-    return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
+    return Recording("NanoSurf .nid", name, segments, units, settings=header)
 
 
 # ---- Igor
 
 
 def parse_igor(data: bytes, name: str) -> Recording:
-    """Read Asylum's binary waves: a column, or an image, for each channel, notes of `key: value`, SI units.
+    """Read ramps in Asylum's binary waves: a column for each channel, notes of `key: value`, SI units.
 
     Raises:
         TableError: if it is damaged, or the package that reads it is missing; the line names the extra.
@@ -291,49 +250,25 @@ def parse_igor(data: bytes, name: str) -> Recording:
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    side = numbers.ndim - 1
-    labels = _igor_labels(data, wave["bin_header"], min(side, 2))
-    if side not in {1, 2} or len(labels) != numbers.shape[side]:
-        raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
+    labels = _igor_labels(data, wave["bin_header"])
+    if numbers.ndim != 2 or len(labels) != numbers.shape[1]:
+        raise TableError(f"{name}: holds no labelled columns of a ramp; energies of images: afm-jax tapping-map")
     header = _settings(bytes(wave["note"]), ":")
-    known = known_from(header, "note")
-    phase, said = (number_in(header.get(f"FreeAir{what}", "")) for what in ("Phase", "Amplitude"))
-    if phase is not None:
-        known["free_phase_deg"] = Known(phase[0], "deg", "note: FreeAirPhase")
-    if said is not None and said[0] > 0.0 and (said[0] < 1e-5 or "nm_per_volt" in known):
-        # in volts, or in metres where tiny
-        factor, how = (1e9, "m") if said[0] < 1e-5 else (float(known["nm_per_volt"].value), "V, times AmpInvOLS")
-        known["free_amplitude_nm"] = Known(said[0] * factor, "nm", f"note: FreeAirAmplitude, assumed in {how}")
     units = {label: "deg" if re.match("pha", label, re.IGNORECASE) else "m" for label in labels}
-    # Igor counts columns first, and rows from below
-    columns = {
-        label: (numbers[..., ::-1, k].T if side == 2 else numbers[:, k].copy()) for k, label in enumerate(labels)
-    }
-    # the row of an index is the last of its segment
-    ends = [0, *(int(index) + 1 for index in header.get("Indexes", "").split(",")[1:])]
-    ways = [{"1": "approach", "-1": "retract"}.get(way.strip()) for way in header.get("Direction", "").split(",")[1:]]
-    segments = [
-        Segment(1, way, {label: column[first:last] for label, column in columns.items()})
-        for (first, last), way in zip(pairwise(ends), ways, strict=False)
-        if way is not None
-    ]
-    sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
-    size = None if None in sides else (sides[0][0], sides[1][0])  # type: ignore[index]
-    whole = (Segment(1, "", columns),) if side == 2 or not segments else tuple(segments)
-    kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
-    return Recording(kind, name, whole, units, known, settings=header, size_m=size)
+    columns = {label: column.copy() for label, column in zip(labels, numbers.T, strict=True)}
+    segments = (Segment(1, "", columns),)
+    return Recording("Igor .ibw ramp", name, segments, units, settings=header)
 
 
-def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
-    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
+def _igor_labels(data: bytes, header: Mapping[str, Any]) -> list[str]:
+    """Return the labels of a wave's columns: texts in fields of 32 bytes, that of all columns first.
 
     What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
     """
-    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
-    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
-    # behind a header of 64 bytes; version 5 is the only one with labels
-    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
-    fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
+    sizes = [int(size) for size in header.get("dimLabelsSize", [0, 0])]
+    # the labels of all sides stand in front of the file's end; version 5 is the only one with labels
+    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[1:])
+    fields = [data[place : place + 32] for place in range(start + 32, start + sizes[1], 32)]
     # UTF-8 since version 7 of Igor
     texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
     return [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
@@ -348,7 +283,7 @@ def _igor_points(data: bytes) -> int:
     return int(announced.max()) if announced.min() >= 0 else len(data) + 1
 
 
-IGOR = (b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02")
-"""What Igor's binary waves begin with: version 5 or 2, in either order of bytes."""
-MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf, **dict.fromkeys(IGOR, parse_igor)}
+MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}
+# Igor's binary waves: version 5 or 2, in either order of bytes
+MARKS |= dict.fromkeys((b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"), parse_igor)
 """Formats by what their files begin with."""

@@ -1,7 +1,7 @@
 """Amplitude and phase of every pixel, out of arrays and the files of images that instruments write.
 
-Asylum's .ibw is read by igor2 (`pip install 'afm-jax[instruments]'`), every other format by gwyddionpy, which runs
-Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays need nothing.
+Files of instruments are read by gwyddionpy, which runs Gwyddion's own readers (`pip install 'afm-jax[gwyddion]'`).
+NumPy's arrays need nothing.
 """
 
 import io
@@ -13,14 +13,13 @@ from jaxtyping import Float
 
 from afm_jax.words import printable
 from fitting.instruments.columns import needed_channel, parse_columns
-from fitting.instruments.formats import IGOR, parse_igor
+from fitting.instruments.formats import name_and_unit
 from fitting.instruments.recording import (
     UNITS,
     Known,
     Recording,
     Segment,
     damaged_as_one_line,
-    known_from,
     package_for,
     refuse_other_modes,
     unit_named,
@@ -61,7 +60,7 @@ def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> Amp
     """Return amplitude and phase of every pixel of an image.
 
     Args:
-        path: NumPy .npz or .npy, Asylum .ibw or any format that Gwyddion reads; or the arrays of amplitude in nm and
+        path: NumPy .npz or .npy, or any format that Gwyddion reads; or the arrays of amplitude in nm and
             phase in degrees, the channels `amplitude` and `phase`.
         columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
             leads.
@@ -109,14 +108,11 @@ def _read(path: str | Path) -> Recording:
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
             arrays = loaded if hasattr(loaded, "files") else dict(zip(_ROLES.values(), loaded, strict=False))
             arrays = {printable(key): array for key, array in arrays.items()}
-            spelled = {unit.lower(): unit for unit in UNITS}
-            units = {key: spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
+            units = {key: name_and_unit(key)[1] for key in arrays}
             images = {key: image for key, image in arrays.items() if image.ndim == 2 and image.dtype.kind in "fiu"}
             if not images:
                 raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
             return Recording("arrays", name, (Segment(1, "", images),), units)
-        if data.startswith(IGOR):
-            return parse_igor(data, name)
         return _of_others(Path(path), name)
 
 
@@ -137,4 +133,4 @@ def _of_others(path: Path, name: str) -> Recording:
     settings = {str(key): str(value) for one in reversed(found) for key, value in one.meta.items()}
     size = float(found[0].yreal), float(found[0].xreal)
     segments = (Segment(1, "", dict(reversed(channels.items()))),)
-    return Recording("Gwyddion", name, segments, units, known_from(settings), settings=settings, size_m=size)
+    return Recording("Gwyddion", name, segments, units, settings=settings, size_m=size)

@@ -90,6 +90,15 @@ class PhaseReadings(NamedTuple):
         return free_lag_deg(self.drive, self.frequency_ratio, self.quality_factor)
 
     @property
+    def disturbed(self) -> tuple["PhaseReadings", "PhaseReadings"]:
+        """The readings with another frequency, and with another Q: by the standard error of each."""
+        ratio, quality = self.frequency_ratio, self.quality_factor
+        return (
+            self._replace(frequency_ratio=ratio * (1.0 + self.frequency_error)),
+            self._replace(quality_factor=quality * (1.0 + self.quality_error)),
+        )
+
+    @property
     def seen_free(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the free tip that have a phase."""
         return self.free & np.isfinite(self.phase_deg)
@@ -157,12 +166,8 @@ class PhaseReadings(NamedTuple):
         lag_error = np.hypot(self.phase_error_deg, 0.5)
         if not self.seen_free.any() and self.zero is not None:
             lag_error = np.hypot(lag_error, self.zero[1])
-        changes = (
-            {"ratio": self.ratio + self.ratio_error},
-            {"frequency_ratio": self.frequency_ratio * (1.0 + self.frequency_error)},
-            {"quality_factor": self.quality_factor * (1.0 + self.quality_error)},
-        )
-        moved = [self.energy(behind + lag_error), *(self._replace(**change).energy(behind) for change in changes)]
+        others = (self._replace(ratio=self.ratio + self.ratio_error), *self.disturbed)
+        moved = [self.energy(behind + lag_error), *(other.energy(behind) for other in others)]
         error = np.linalg.norm(np.array(moved) - start, axis=0)
         with np.errstate(invalid="ignore"):
             return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))
@@ -267,10 +272,8 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     zero = float(np.median(readings.zero_deg(sign)))
     reason = ""
     if by_energy == 0.0:
-        reason = (
-            "with either sign of the phase taps would gain energy: frequency, Q, the drive (force or base) or the "
-            "phase is wrong"
-        )
+        wrong = "frequency, Q, the drive (force or base) or the phase is wrong"
+        reason = f"with either sign of the phase taps would gain energy: {wrong}"
     elif by_energy is not None and by_energy != sign:
         rows = readings.giving_energy_away(sign)
         reason = (
@@ -285,12 +288,6 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
 
 
-_HOW = {
-    "energy": "with the other sign taps would gain energy",
-    "order": "attraction reaches farther than repulsion",
-}
-
-
 def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -> tuple[str, ...]:
     """Return the notes on a sign that is not stated, and not that of a lag, and on a zero that is quarter turns off."""
     free, reads, notes = readings.seen_free, "no row of the free tip has a phase", []
@@ -302,7 +299,9 @@ def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -
         both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; "
         notes.append(f"Sign: {reads}: {taken}; {both if origin == 'assumed' else ''}say {SENSE_OPTION}.")
     elif sign < 0.0 and origin != "stated":
-        notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
+        by_order = "attraction reaches farther than repulsion"
+        how = by_order if origin == "order" else "with the other sign taps would gain energy"
+        notes.append(f"Sign: {reads}: the phase leads ({how}), and its sign was reversed.")
     quarters = 90 * round(zero_deg / 90.0)
     if quarters and abs(turned(zero_deg - quarters)) < _NEAR_DEG:
         notes.append(f"Zero: {reads}: the instrument's zero is {quarters:+d} degrees off; the free tip determines it.")

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -22,7 +23,6 @@ _SIZES = {
     "voltage": {"V": 1.0, "mV": 1e-3},
     "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
     "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
-    "force": {"N": 1e9, "nN": 1.0, "pN": 1e-3},
     "stiffness": {"N/m": 1.0},
     "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
     "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
@@ -30,7 +30,7 @@ _SIZES = {
 }
 UNITS = {unit: (quantity, size) for quantity, sizes in _SIZES.items() for unit, size in sizes.items()}
 """What a unit measures, and its size in this package's unit: nm, V, degrees, kHz, nN, N/m, nm/V, nm per root Hz."""
-_SPELLINGS = {"µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
+_SPELLINGS = {"v": "V", "µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
 
 
 def unit_named(text: str) -> str:
@@ -53,7 +53,7 @@ class Known:
     Attributes:
         value: in the unit of its key; a word where it is none.
         unit: of a number; empty for a plain one.
-        origin: "header: ...", "note: ...", "option ...", "measured: ..." or "assumed: ...".
+        origin: "header: ...", "option ...", "measured: ..." or "assumed: ...".
         error: its standard error, None where not known.
     """
 
@@ -98,10 +98,8 @@ class Recording:
     Attributes:
         format: its name: "neaSNOM text", "WSxM curves", ...
         source: path as it was given.
-        segments: in the order of the file.
+        segments: in the order of the file; heights grow towards the tip.
         units: unit of every channel, a key of `UNITS` or as the file spells it; empty: the file does not say.
-        known: what the header says, by this package's keys.
-        away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
         settings: what the header says, as the file spells it.
         size_m: height and width of images, or None.
@@ -111,11 +109,14 @@ class Recording:
     source: str
     segments: tuple[Segment, ...]
     units: Mapping[str, str]
-    known: dict[str, Known] = field(default_factory=dict)
-    away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
     size_m: tuple[float, float] | None = None
+
+    @cached_property
+    def known(self) -> dict[str, Known]:
+        """What the header says, by this package's keys."""
+        return known_from(self.settings)
 
     @property
     def channels(self) -> list[str]:
@@ -143,7 +144,6 @@ _HEADER = {
     "quality_factor": ("", "", "Q|Quality factor (Q)|Q Factor:|ThermalQ"),
     "spring_constant_n_per_m": ("N/m", "N/m", "Force constant|Spring Constant:|SpringConstant"),
     "free_amplitude_nm": ("nm", "", ""),
-    "deflection_nm_per_volt": ("nm/V", "m/V", "InvOLS"),
     "nm_per_volt": ("nm/V", "m/V", "AmpInvOLS"),
     "averages": ("", "", "Averages"),
 }
@@ -151,12 +151,11 @@ _HEADER = {
 own name it stands in its own unit."""
 
 
-def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Known]:
+def known_from(header: Mapping[str, str]) -> dict[str, Known]:
     """Return what the lines of a header say of the measurement, in this package's units.
 
     Args:
         header: texts by the names that the file gives them.
-        where: what the place is called: "header" or "note".
     """
     found = {}
     for key, (own_unit, usual, names) in _HEADER.items():
@@ -166,35 +165,25 @@ def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Kn
                 quantity, factor = UNITS.get(said[1] or (own_unit if name == key else usual), ("", 1.0))
                 if quantity == quantity_of(own_unit):
                     # twelve digits: a change of unit must not add others
-                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"{where}: {name}")
+                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"header: {name}")
+    warm = number_in(header.get("Cantilever temperature", ""))
+    if warm is not None and -100.0 < warm[0] < 500.0:
+        origin = "header: Cantilever temperature, assumed in degrees Celsius"
+        found["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     return found
 
 
-UNIT_OF = {
-    "drive_frequency_khz": "kHz",
-    "free_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "free_phase_deg": "deg",
-    "nm_per_volt": "nm/V",
-    "tip_calibration": "",
-    "offset_origin_nm": "nm",
-    "amplitude_error_nm": "nm",
-    "phase_error_deg": "deg",
-}
+UNIT_OF = {key: unit for key, (unit, _, _) in _HEADER.items() if key != "averages"}
+UNIT_OF |= {"free_phase_deg": "deg", "tip_calibration": "", "offset_origin_nm": "nm"}
 """Numbers of lever, drive and instrument that a caller may give, with their units."""
 
 
-def given_numbers(
-    numbers: Mapping[str, Any], units: Mapping[str, str], *, any_sign: Sequence[str] = ()
-) -> dict[str, Known]:
+def given_numbers(numbers: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Known]:
     """Return what a caller gives of the instrument, by name.
 
     Args:
         numbers: each a number, a pair with its standard error or a text such as '44 +- 4'; None: not given.
         units: of those that may be given.
-        any_sign: those that need not be above 0.
 
     Raises:
         TypeError: if there is none of a name.
@@ -205,7 +194,7 @@ def given_numbers(
         if key not in units:
             raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
         if given is not None:
-            number, error = given_value(key, given, any_sign=key in any_sign)
+            number, error = given_value(key, given, any_sign=key in {"free_phase_deg", "offset_origin_nm"})
             found[key] = Known(number, units[key], f"option `{key}=...`", error)
     return found
 
@@ -239,10 +228,6 @@ _OTHER_MODES = re.compile(
     re.IGNORECASE,
 )
 _MODE_KEYS = re.compile(r"((imaging|operating|operation|op\.|afm|feedback|scan)[ _-]?)?mode", re.IGNORECASE)
-_STRICT_KEYS = {"ImagingMode", "Op. mode"}
-"""Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
-
-
 _OTHER_CHANNELS = re.compile(
     r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
     re.IGNORECASE,
@@ -259,10 +244,8 @@ def refuse_other_modes(settings: Mapping[str, str], source: str, channels: Itera
     found = [f"holds a channel {name!r}, which is none of" for name in channels if _OTHER_CHANNELS.fullmatch(name)]
     for key, value in settings.items():
         name = re.split(r"::|[/:]", key)[-1].strip()
-        others = _AMPLITUDE_MODES.sub("", value)
-        strict = name in _STRICT_KEYS and others == value
-        bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
-        if bimodal or strict or (_MODE_KEYS.fullmatch(name) and _OTHER_MODES.search(others)):
+        other = _MODE_KEYS.fullmatch(name) and _OTHER_MODES.search(_AMPLITUDE_MODES.sub("", value))
+        if other or (name == "DualACMode" and value.strip() not in {"", "0"}):
             found.insert(0, f"was recorded in the mode {printable(value)!r} ({printable(key)}), not in")
     if found:
         why = "amplitude modulation (tapping) of one mode; its amplitude and phase do not give the energy of a tap"

@@ -68,11 +68,11 @@ _OWN = ("free_amplitude_nm", "offset_origin_nm", "phase_zero_deg", "amplitude_er
 
 def _row(curve: MeasuredCurve) -> list[str]:
     unit, free = curve.amplitude_unit, curve.number("free_amplitude_nm")
-    if free is None and curve.amplitude is not None and curve.free.any():
+    if free is None and curve.free.any():
         free = float(np.median(curve.amplitude[curve.free]))
     branches = [f"{np.sum(curve.branch == name)} {name}" for name in dict.fromkeys(curve.branch.tolist())]
     heights = f"{curve.offset_nm.min():.1f} to {curve.offset_nm.max():.1f}"
-    level = "-" if free is None or curve.amplitude is None else f"{free:.5g} {unit}"
+    level = "-" if free is None else f"{free:.5g} {unit}"
     slope = "-" if curve.slope is None else f"{curve.slope[0]:.3g} {unit}/nm"
     return [str(curve.curve), " + ".join(branches), heights, level, slope, "" if curve.valid else "refused"]
 

@@ -8,7 +8,7 @@ read by the same functions.
 import csv
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -347,12 +347,10 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{quoted(text)} is no known setting; the key is {key}, as in '{setting.line}'")
     # Spreadsheets fill every line up with commas.
     value = match["value"].rstrip(",; \t").strip()
-    if value in setting.choices:
-        return value, None
-    if setting.choices:
+    if setting.choices and value not in setting.choices:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
-    if setting.none and value == "none":
-        return None, None
+    if setting.choices or (setting.none and value == "none"):
+        return (value if setting.choices else None), None
     number, error = value_and_error(value, f"'{setting.line}', with a decimal point and without the unit")
     if setting.error == ("always" if error is None else "never"):
         raise ValueError(f"{key} {'needs its' if error is None else 'takes no'} standard error; write '{setting.line}'")
@@ -411,17 +409,59 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     return None
 
 
-def cells_of(text: str, separator: str) -> list[str]:
-    """Return the cells of one line, without the spaces and quotation marks around them."""
-    # instruments end their lines with a tab, and put several spaces between columns
-    text = text.rstrip(" ").removesuffix("\t" if separator == "\t" else "")
-    return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
+def read_cells(rows: NumberedLines, source: Source) -> Iterator[list[str]]:
+    """Give the cells of each line, as many in each as in the first, without the spaces and quotation marks around them.
+
+    A separator that ends a line begins no cell, and decimal commas become points.
+
+    Args:
+        rows: lines with their numbers, at least one.
+        source: for messages.
+
+    Raises:
+        TableError: if a line has another number of cells, or less than two.
+    """
+    # names may hold commas, and the last row may be cut off
+    separator = _separator_of(rows[len(rows) // 2][1])
+    width = 0
+    all_cells = _cells_of((text for _, text in rows), separator)
+    for (line, text), cells in zip(rows, all_cells, strict=False):
+        if text.count('"') % 2:
+            raise source.fault("a quotation mark is not closed; close or remove it", line=line)
+        width = width or len(cells) - (not cells[-1])
+        if len(cells) == width + 1 and not cells[-1]:
+            cells.pop()
+        if width < 2:
+            raise source.fault("columns separated by commas, tabs, semicolons or blanks are expected here", line=line)
+        if len(cells) != width:
+            mend = "fill the row up, and write points for decimal commas"
+            raise source.fault(f"there are {len(cells)} cells for {width} columns; {mend}", line=line)
+        yield cells
+
+
+def _cells_of(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
+    # several spaces may stand between columns
+    for row in csv.reader((line.strip(" ") for line in lines), delimiter=separator, skipinitialspace=True):
+        cells = [cell.strip() for cell in row]
+        yield [cell.replace(",", ".") if "," in cell and DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+
+
+def _separator_of(row: str) -> str:
+    """Return what separates numbers: commas only where they are no decimal commas."""
+    for sign in ",\t; ":
+        cells = [cell for cell in next(_cells_of([row], sign)) if cell]
+        if len(cells) > 1 and all(map(NUMBER.fullmatch, cells)):
+            return sign
+    return next((sign for sign in "\t;, " if sign in row.strip()), ",")
+
+
+def numbers_of(cells: Sequence[str]) -> Rows:
+    """Return the numbers in cells, NaN where a cell holds none."""
+    return np.array([float(cell) if NUMBER.fullmatch(cell) else math.nan for cell in cells])
 
 
 def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns, Lines]:
     """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
-
-    Commas, tabs, semicolons or spaces stand between cells, as the row of names has them.
 
     Args:
         rows: lines with their numbers, the column names first.
@@ -429,29 +469,20 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
         source: for messages.
 
     Raises:
-        TableError: at once where the column names are wrong: the cells below cannot be judged then.
+        TableError: if names, or a cell, are wrong.
     """
-    head, text = rows[0]
-    separator = next((sign for sign in ",\t; " if sign in text.strip()), ",")
-    names = cells_of(text, separator)
-    check_names(names, form, source, line=head)
-    columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
-    lines = []
-    for line, text in rows[1:]:
-        cells = cells_of(text, separator)
-        if text.count('"') % 2:
-            raise source.fault("a quotation mark is not closed; close or remove it", line=line)
-        if len(cells) != len(names):
-            mend = "fill the row up, and write points for decimal commas"
-            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {mend}", line=line)
-        lines.append(line)
-        for name, cell in zip(names, cells, strict=True):
-            if name in columns:
-                columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
-                if math.isnan(columns[name][-1]) and (cell or not form.blanks):
-                    wrong = f"{quoted(cell)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
-                    raise source.fault(wrong, line=line, column=name)
-    return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
+    table = read_cells(rows, source)
+    names = next(table)
+    check_names(names, form, source, line=rows[0][0])
+    lines = np.array([line for line, _ in rows[1:]])
+    columns = {}
+    for name, cells in zip(names, zip(*table, strict=True), strict=True):
+        if name in form.names:
+            columns[name] = numbers_of(cells)
+            bad = np.isnan(columns[name]) & ~(np.array([not cell for cell in cells]) & form.blanks)
+            wrong = f"{quoted(cells[np.argmax(bad)])} is not a number like 90.25 or 9.025e1"
+            source.refuse(bad, f"{wrong}; correct it or remove the row", lines, name)
+    return columns, lines
 
 
 def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from afm_jax.solve.least_squares import chi2_tail
 from fitting.tables.table import (
@@ -59,19 +59,18 @@ class SeveralTables:
         known: dict[tuple[bytes, ...], str] = {}
         for table, label in zip(self.tables, self.labels, strict=True):
             # noise alone makes no two measurements alike
-            columns = [getattr(table, name) for name in _READINGS]
-            other = known.setdefault(tuple(b"" if one is None else one.tobytes() for one in columns), label)
+            readings = tuple(np.array(getattr(table, name), dtype=float).tobytes() for name in _READINGS)
+            other = known.setdefault(readings, label)
             if other is not label:
                 raise ValueError(f"{label} holds the same readings as {other}; give each table once")
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """What each table is called: its file's name; its path, or this and a number, where that is another's too."""
-        paths = [table.source for table in self.tables]
-        for names in (tuple(Path(path).name for path in paths), tuple(paths)):
-            if len(set(names)) == len(names):
-                return names
-        return tuple(f"{path} ({number})" for number, path in enumerate(paths, 1))
+        """What each table is called: its file's name; its path and number where two files have one name."""
+        names = [Path(table.source).name for table in self.tables]
+        if len(set(names)) == len(names):
+            return tuple(names)
+        return tuple(f"{table.source} ({number})" for number, table in enumerate(self.tables, 1))
 
     @property
     def source(self) -> str:
@@ -109,18 +108,14 @@ class SeveralTables:
         return self.tables[0].mass_ng
 
     def __getattr__(self, name: str) -> Any:
-        """Return what each table has a number a row of, for all rows: frequency, amplitude and offset of the drive."""
+        """Return what each table has a number a row of, for all rows; 0 of `no_orbit` where a table has none."""
         if name not in _STACKED:
             raise AttributeError(name)
-        return np.concatenate([getattr(table, name) for table in self.tables])
-
-    @property
-    def no_orbit(self) -> Float[np.ndarray, " rows"]:
-        """1 where the tip settled on no single-impact orbit, else 0."""
-        return np.concatenate([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
+        columns = [getattr(table, name) for table in self.tables]
+        return np.concatenate([np.zeros(self.tables[i].rows) if c is None else c for i, c in enumerate(columns)])
 
 
-_STACKED = ("lines", "order", "drive_frequency_khz", "excitation_nm", "offset_nm")
+_STACKED = ("lines", "order", "drive_frequency_khz", "excitation_nm", "offset_nm", "no_orbit")
 _READINGS = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
 """What tells tables apart."""
 _SAME_MASS = 0.01

@@ -212,13 +212,12 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
     Returns:
         A remark for each column that errors were added for.
     """
-    lacking = [column for column in MEASURED if column.name in columns and str(column.error) not in columns]
-    if not lacking or not all(np.isfinite(columns[one.name]).all() for one in required(columns)):
-        return []
-    from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
-
     remarks = []
-    for column in lacking:
+    for column in MEASURED:
+        if column.name not in columns or str(column.error) in columns:
+            continue
+        from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
+
         values = columns[column.name]
         known = np.isfinite(values) & ((values > 0.0) | (not column.amplitude))
         there, freedom, chi2 = scatter_about_means(column, columns, None)
@@ -522,8 +521,7 @@ def as_table(given: TableLike, *, noise: float | None = None, quality_factor: An
         given = read_table(Path(os.fspath(given)), noise)
     if quality_factor is None:
         return given
-    none = quality_factor == "none"
-    value, error = (None, None) if none else given_value("quality_factor", quality_factor)
+    value, error = (None, None) if quality_factor == "none" else given_value("quality_factor", quality_factor)
     return replace(given, quality_factor=value, quality_factor_error=error)
 
 

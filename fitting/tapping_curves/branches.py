@@ -137,7 +137,7 @@ def free_rows(curve: TappingCurve) -> Mask:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
     A single row that departs is none; the zero of the phase is that of the rows farther away. Each row is tested by its
-    own error. `fitting.instruments.branch.look_at` looks for the free part of a recording of unknown noise, in blocks.
+    own error. `fitting.instruments.branch.look_at` looks for the free part of a recording of unknown noise.
     """
     free = np.zeros(curve.rows, bool)
     for part in ways(curve):

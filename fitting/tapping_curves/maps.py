@@ -224,7 +224,7 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any]) -> dict[str, Known]
         TableError: if something is missing.
     """
     known = {key: one for key, one in images.known.items() if key in _UNITS}
-    known |= given_numbers(given, _UNITS, any_sign=("free_phase_deg",))
+    known |= given_numbers(given, _UNITS)
     needed = _NEEDED | ({"nm_per_volt": "NM"} if images.in_volts else {})
     missing = " ".join(f"`{key}={unit}`" for key, unit in needed.items() if key not in known)
     if missing:
