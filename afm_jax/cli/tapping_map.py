@@ -44,12 +44,12 @@ def map_of_an_image(
     """Determine the energy of a tap and the virial at every pixel of an image of amplitude and phase.
 
     IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), or an instrument's file with
-    channels of both that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs its program on the file).
-    Amplitude and phase of the free tip at the same drive are required. Each pixel has its own error; the common error
-    (spring constant, frequency, Q, calibration, free amplitude and phase) is given once. Pixels out of range (amplitude
-    above the free one, energy below zero beyond its error) are masked and counted. With --out map.png, .json, .txt and
-    the arrays. Exit code 3 if most pixels are out of range, the median energy is below zero or only bracketed, or the
-    unknown sense of the phase decides.
+    channels of both: Asylum .ibw (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install
+    'afm-jax[gwyddion]'`, which runs its program on the file). Amplitude and phase of the free tip at the same drive are
+    required. Each pixel has its own error; the common error (spring constant, frequency, Q, calibration, free amplitude
+    and phase) is given once. Pixels out of range (amplitude above the free one, energy below zero beyond its error) are
+    masked and counted. With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
+    median energy is below zero or only bracketed, or the unknown sense of the phase decides.
 
     Args:
         session: of the call.

@@ -148,7 +148,8 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
 
     A curve that first falls slowly (attraction) and then by 1 nm per nm (a hard sample) tells the scale of its
     amplitude by the second part only. Lines are laid through all windows of a nm or more; of those as steep as the
-    steepest within their errors the one nearest to the sample is taken.
+    steepest within their errors the one nearest to the sample is taken, longer where its slope is known to worse than
+    3 % and the rows before it lie on the same line.
 
     Args:
         offset: heights, rising.
@@ -175,10 +176,12 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
         settled = scatters <= np.maximum(3.0 * usual, 0.06 * length * np.abs(slopes)) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
-        nearest = windows[int(np.flatnonzero(alike)[-1])]
+        start, end, _ = windows[int(np.flatnonzero(alike)[-1])]
+        start = _straight_from(offset[:end], values[:end], start)
+        line = _line(offset[start:end], values[start:end])
         # with a plateau the line through all rows has less than 0.8 of the slope of the steepest part
-        if not (deep and chosen is not None and chosen[0] < 0.8 * nearest[2][0]):
-            first, last, chosen = nearest
+        if not (deep and line is not None and chosen is not None and chosen[0] < 0.8 * line[0]):
+            first, last, chosen = start, end, line
     # a slope differs from 0 by four standard errors
     if chosen is None or not chosen[0] < -4.0 * chosen[1]:
         return None
@@ -187,6 +190,20 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
     error = max(chosen[1], usual / float(np.linalg.norm(part - part.mean())))
     bend = 0.1 * float(np.hypot(*_change_of_slope(part, values[first:last])))
     return ContactSlope(chosen[0], error, bend, part, float(values[first:last].mean()))
+
+
+def _straight_from(offset: Rows, values: Rows, first: int) -> int:
+    """Return from which row on the slope is known to 3 %, as far as the rows up to the last lie on a line."""
+    step = max(len(offset) - first, 4) // 4
+    while first > 0:
+        line = _line(offset[first:], values[first:])
+        trial = max(first - step, 0)
+        known = line is not None and line[1] < 0.03 * abs(line[0])
+        change, error = _change_of_slope(offset[trial:], values[trial:])
+        if known or len(offset) - trial < 6 or abs(change) > 2.0 * error + 1e-12 * abs(values[-1]):
+            break
+        first = trial
+    return first
 
 
 def _change_of_slope(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from fitting.instruments.recording import (
     Segment,
     cut_off,
     damaged_as_one_line,
+    number_in,
     package_for,
     two_ways,
     unit_named,
@@ -58,6 +59,8 @@ def read_recording(path: str | Path) -> Recording:
     parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse_text)
     with damaged_as_one_line(name):
         recording = parse(data, name)
+    if any(np.ndim(v) != 1 for s in recording.segments for v in s.channels.values()):
+        raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
     return recording
@@ -235,7 +238,7 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
 
 
 def parse_igor(data: bytes, name: str) -> Recording:
-    """Read ramps in Asylum's binary waves: a column for each channel, notes of `key: value`, SI units.
+    """Read Asylum's binary waves: a column, or an image, for each channel, notes of `key: value`, SI units.
 
     Raises:
         TableError: if it is damaged, or the package that reads it is missing; the line names the extra.
@@ -250,25 +253,32 @@ def parse_igor(data: bytes, name: str) -> Recording:
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    labels = _igor_labels(data, wave["bin_header"])
-    if numbers.ndim != 2 or len(labels) != numbers.shape[1]:
-        raise TableError(f"{name}: holds no labelled columns of a ramp; energies of images: afm-jax tapping-map")
+    side = min(max(numbers.ndim - 1, 1), 2)
+    labels = _igor_labels(data, wave["bin_header"], side)
+    if numbers.ndim != side + 1 or len(labels) != numbers.shape[side]:
+        raise TableError(
+            f"{name}: holds an array of {numbers.ndim} dimensions, no labelled channels of a ramp or an image"
+        )
     header = _settings(bytes(wave["note"]), ":")
     units = {label: "deg" if re.match("pha", label, re.IGNORECASE) else "m" for label in labels}
-    columns = {label: column.copy() for label, column in zip(labels, numbers.T, strict=True)}
-    segments = (Segment(1, "", columns),)
-    return Recording("Igor .ibw ramp", name, segments, units, settings=header)
+    # of an image Igor counts columns first, and rows from below
+    channels = numbers if side == 1 else numbers[:, ::-1].swapaxes(0, 1)
+    columns = {label: channels[..., number].copy() for number, label in enumerate(labels)}
+    sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
+    size = None if sides[0] is None or sides[1] is None else (sides[0][0], sides[1][0])
+    kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
+    return Recording(kind, name, (Segment(1, "", columns),), units, settings=header, size_m=size)
 
 
-def _igor_labels(data: bytes, header: Mapping[str, Any]) -> list[str]:
-    """Return the labels of a wave's columns: texts in fields of 32 bytes, that of all columns first.
+def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
+    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
 
     What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it).
     """
-    sizes = [int(size) for size in header.get("dimLabelsSize", [0, 0])]
+    sizes = [int(size) for size in header.get("dimLabelsSize", [0, 0, 0])]
     # the labels of all sides stand in front of the file's end; version 5 is the only one with labels
-    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[1:])
-    fields = [data[place : place + 32] for place in range(start + 32, start + sizes[1], 32)]
+    start = len(data) - int(header.get("sIndicesSize", 0)) - sum(sizes[side:])
+    fields = [data[place : place + 32] for place in range(start + 32, start + sum(sizes[side : side + 1]), 32)]
     # UTF-8 since version 7 of Igor
     texts = [text_of(field.partition(b"\0")[0], "label", "", latin=True) for field in fields]
     return [printable(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
@@ -283,7 +293,7 @@ def _igor_points(data: bytes) -> int:
     return int(announced.max()) if announced.min() >= 0 else len(data) + 1
 
 
-MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}
-# Igor's binary waves: version 5 or 2, in either order of bytes
-MARKS |= dict.fromkeys((b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"), parse_igor)
+IGOR = (b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02")
+"""What Igor's binary waves begin with: version 5 or 2, in either order of bytes."""
+MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf, **dict.fromkeys(IGOR, parse_igor)}
 """Formats by what their files begin with."""

@@ -1,7 +1,7 @@
 """Amplitude and phase of every pixel, out of arrays and the files of images that instruments write.
 
-Files of instruments are read by gwyddionpy, which runs Gwyddion's own readers (`pip install 'afm-jax[gwyddion]'`).
-NumPy's arrays need nothing.
+Asylum's .ibw is read by igor2 (`pip install 'afm-jax[instruments]'`), every other format by gwyddionpy, which runs
+Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays need nothing.
 """
 
 import io
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from afm_jax.words import printable
 from fitting.instruments.columns import needed_channel, parse_columns
-from fitting.instruments.formats import name_and_unit
+from fitting.instruments.formats import IGOR, name_and_unit, parse_igor
 from fitting.instruments.recording import (
     UNITS,
     Known,
@@ -60,7 +60,7 @@ def read_images(path: str | Path | tuple[Any, Any], *, columns: str = "") -> Amp
     """Return amplitude and phase of every pixel of an image.
 
     Args:
-        path: NumPy .npz or .npy, or any format that Gwyddion reads; or the arrays of amplitude in nm and
+        path: NumPy .npz or .npy, Asylum .ibw or any format that Gwyddion reads; or the arrays of amplitude in nm and
             phase in degrees, the channels `amplitude` and `phase`.
         columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
             leads.
@@ -113,6 +113,8 @@ def _read(path: str | Path) -> Recording:
             if not images:
                 raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
             return Recording("arrays", name, (Segment(1, "", images),), units)
+        if data.startswith(IGOR):
+            return parse_igor(data, name)
         return _of_others(Path(path), name)
 
 
