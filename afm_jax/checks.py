@@ -161,21 +161,14 @@ def checked(function: Function) -> Function:
         TypeError: by the function, naming the argument, what it must be and what it is.
     """
     signature = inspect.signature(function)
-    hints: dict[str, Any] = {}
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        if not hints:
-            several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-            for name, parameter in signature.parameters.items():
-                hints[name] = Any if parameter.kind in several else _resolved(parameter.annotation, function)
-        try:
-            given = signature.bind(*arguments, **named).arguments
-        except TypeError:
-            # what is missing or too much Python itself says best
-            return function(*arguments, **named)
-        for name, value in given.items():
-            check_kind(name, value, hints[name])
+        several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        for name, value in signature.bind(*arguments, **named).arguments.items():
+            parameter = signature.parameters[name]
+            if parameter.kind not in several:
+                check_kind(name, value, _resolved(parameter.annotation, function))
         return function(*arguments, **named)
 
     return cast("Function", call)
@@ -208,37 +201,23 @@ def _misfit(kind: Any, value: Any) -> str:
     if kind is Any or isinstance(kind, TypeVar | str) or is_traced(value):
         return ""
     parts = get_args(kind)
-    if get_origin(kind) not in (Union, types.UnionType):
-        return _misfit_of_one(get_origin(kind) or kind, parts, value)
-    words = []
-    if complex in parts:
-        # true, false and complex numbers are among JAX's numbers, but none here
-        words = ["" if _is_real(value) else "a real number or an array of them"]
-        parts = tuple(part for part in parts if part is type(None))
-    words += [_misfit(part, value) for part in parts]
-    return "" if "" in words else " or ".join(dict.fromkeys(words))
-
-
-def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noqa: PLR0911
-    """Return what a value must be that is not of a class, with what stands in its brackets; nothing where it is."""
-    simple = _SIMPLE.get(kind)
-    if simple is not None:
-        return "" if simple[1](value) else simple[0]
+    kind = get_origin(kind) or kind
+    if kind in (Union, types.UnionType):
+        # what JAX takes for a number; true, false and complex numbers are among it, but none here
+        parts = tuple(part for part in parts if part in (complex, type(None))) if complex in parts else parts
+        words = [_misfit(part, value) for part in parts]
+        return "" if "" in words else " or ".join(dict.fromkeys(words))
     if kind is Literal:
         return "" if value in parts else f"one of {', '.join(map(repr, parts))}"
-    if hasattr(kind, "array_type"):
-        return "" if is_array(value) or _is_real(value) else "an array of real numbers"
     if kind in (list, tuple, collections.abc.Sequence):
         return _misfit_of_several(kind, parts, value)
-    if kind in (dict, collections.abc.Mapping):
-        return "" if isinstance(value, collections.abc.Mapping) else "a dictionary"
-    if not isinstance(kind, type) or isinstance(value, kind):
-        return ""
+    must, fits = _SIMPLE.get(np.ndarray if hasattr(kind, "array_type") else kind, ("", None))
+    if fits is not None:
+        return "" if fits(value) else must
     # a named tuple may be written as a plain one
     fields = getattr(kind, "_fields", None)
-    if fields is not None and isinstance(value, tuple) and len(value) == len(fields):
-        return ""
-    return _with_article(kind.__name__)
+    is_plain = fields is not None and isinstance(value, tuple) and len(value) == len(fields)
+    return "" if is_plain or not isinstance(kind, type) or isinstance(value, kind) else _with_article(kind.__name__)
 
 
 def _with_article(name: str) -> str:
@@ -283,7 +262,7 @@ def _is_number(value: Any) -> bool:
     return _is_real(value) and np.ndim(value) == 0 and not np.isnan(value)
 
 
-_SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
+_SIMPLE: dict[Any, tuple[str, Callable[[Any], bool] | None]] = {
     int: ("a whole number", _is_whole),
     float: ("a real number", _is_number),
     bool: ("True or False", lambda value: isinstance(value, bool | np.bool_)),
@@ -292,6 +271,10 @@ _SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     str: ("a text", lambda value: isinstance(value, str)),
     os.PathLike: ("a path", lambda value: isinstance(value, os.PathLike)),
     Path: ("a path", lambda value: isinstance(value, os.PathLike)),
+    complex: ("a real number or an array of them", _is_real),
+    np.ndarray: ("an array of real numbers", lambda value: is_array(value) or _is_real(value)),
+    dict: ("a dictionary", lambda value: isinstance(value, collections.abc.Mapping)),
+    collections.abc.Mapping: ("a dictionary", lambda value: isinstance(value, collections.abc.Mapping)),
 }
 
 _LARGEST = 1e30

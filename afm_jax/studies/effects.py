@@ -35,6 +35,7 @@ from afm_jax.motion.trajectory import DensePath
 from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import Result, public_result
 from afm_jax.saved import as_json
+from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.studies.timing import seconds_a_call
 from afm_jax.words import counted, known
 
@@ -122,7 +123,8 @@ def _plain_delay(scene: Scene) -> Any:
 # --- what is compared -------------------------------------------------------------------------------------------------
 
 
-class Change(NamedTuple):
+@dataclass(frozen=True)
+class Change:
     """What changes, relative to the full scene; the phase in degrees; None: not a number."""
 
     peak_amplitude: float | None = None
@@ -138,7 +140,8 @@ class Change(NamedTuple):
         return max(abs(self.peak_amplitude), abs(self.lockin_amplitude))
 
 
-class Reading(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Reading:
     """What a motion shows in a window of time, in a few numbers."""
 
     peak_amplitude_nm: float
@@ -152,6 +155,10 @@ class Reading(NamedTuple):
     energy_per_impact_aj: float | None
     """None without impacts."""
     impacts: int
+    drive_periods: int | None = None
+    """Of the steady orbit; None: there is none, the window is the last fifth of the duration."""
+    time_us_per_period: float | None = None
+    """What computing a drive period takes: the median of several runs."""
 
 
 class Observed(NamedTuple):
@@ -163,25 +170,20 @@ class Observed(NamedTuple):
     orbit: Orbit | None = None
 
 
-class EffectReport(NamedTuple):
+@dataclass(frozen=True)
+class EffectReport:
     """One effect: what leaving it out changes and costs."""
 
-    effect: SceneEffect
+    name: str
+    required: bool
+    """Whether the scene cannot do without it."""
     change: Change
     reason: str | None
     """Why there is no change to tell: the effect is required, or nothing steady is left without it."""
-    cost: float | None
-    """Of the scene without it (see `EffectStudy`); None without a motion to time."""
-
-
-class Reduction(NamedTuple):
-    """What the wanted accuracy of the amplitude does not need."""
-
-    left_out: tuple[str, ...]
-    change: Change
-    """Of all of them together, simulated."""
-    scene: Scene
-    cost: float | None
+    time_us_per_period: float | None
+    """Of the scene without it; None without a motion to time."""
+    needed: bool = True
+    """For the wanted accuracy."""
 
 
 @public_result(picture="afm_jax.plots.effects:effects_figure")
@@ -190,89 +192,70 @@ class EffectStudy(Result):
     """All effects of a scene, and which of them an accuracy of the amplitudes does not need.
 
     Attributes:
-        observed: the full scene.
-        cost: what computing a drive period takes, in us: the median of several runs.
+        full: what the full scene shows.
         effects: each left out.
         accuracy: that is wanted, relative.
-        reduction: what it does not need.
+        not_needed: the effects that it does not need.
+        joint_change: what leaving all of them out changes, simulated.
+        reduced: the scene without them.
+        reduced_time_us_per_period: what computing a drive period of it takes.
     """
 
-    observed: Observed
-    cost: float | None
+    full: Reading
     effects: list[EffectReport]
     accuracy: float
-    reduction: Reduction
+    not_needed: list[str]
+    joint_change: Change
+    reduced: Scene
+    reduced_time_us_per_period: float | None
 
 
 @as_json.register
 def _(study: EffectStudy) -> dict[str, Any]:
-    reading, orbit, reduction = study.observed.reading, study.observed.orbit, study.reduction
-    assert reading is not None  # a study has one  # noqa: S101
-    return {
-        "compared": "last fifth of the duration" if orbit is None else "steady orbits",
-        "full": {
-            **reading._asdict(),
-            "drive_periods": None if orbit is None else orbit.periods,
-            "time_us_per_period": study.cost,
-        },
-        "effects": [
-            {
-                "name": report.effect.name,
-                "required": report.effect.required is not None,
-                "change": report.change._asdict(),
-                "reason": report.reason,
-                "time_us_per_period": report.cost,
-                "needed": report.effect.name not in reduction.left_out,
-            }
-            for report in study.effects
-        ],
-        "accuracy": study.accuracy,
-        "not_needed": list(reduction.left_out),
-        "joint_change": reduction.change._asdict(),
-        "reduced": {"time_us_per_period": reduction.cost},
-    }
+    compared = "last fifth of the duration" if study.full.drive_periods is None else "steady orbits"
+    told = {"compared": compared} | vars(study)
+    time = told.pop("reduced_time_us_per_period")
+    return told | {"reduced": {"time_us_per_period": time, "scene": scene_tables(study.reduced)}}
 
 
 @sections.register
 def _(study: EffectStudy) -> list[Section]:
-    payload, reduction = as_json(study), study.reduction
-    full, joint = payload["full"], payload["joint_change"]
+    full, joint = study.full, study.joint_change
     cells: dict[str, Cell] = {
         "effect": "name",
-        "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
-        "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
-        "phase\ndeg": lambda effect: effect["change"]["lockin_phase_deg"],
-        "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
+        "peak\nchange": lambda effect: _percent(effect.change.peak_amplitude),
+        "lock-in\nchange": lambda effect: _percent(effect.change.lockin_amplitude),
+        "phase\ndeg": lambda effect: effect.change.lockin_phase_deg,
+        "loss/impact\nchange": lambda effect: _percent(effect.change.energy_per_impact),
         "time\nus/period": "time_us_per_period:.4g",
-        "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
+        "": lambda effect: "required" if effect.required else "" if effect.needed else "not needed",
     }
-    periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
+    window = "the last fifth of the duration; no steady orbit"
     summary = (
-        f"Full scene: {counted(full['impacts'], 'impact')} in "
-        f"{window if periods is None else counted(periods, 'drive period')}; "
-        f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
-        f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
-        f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(study.cost, '.4g')} us to compute "
-        "a drive period."
+        f"Full scene: {counted(full.impacts, 'impact')} in "
+        f"{window if full.drive_periods is None else counted(full.drive_periods, 'drive period')}; "
+        f"peak {full.peak_amplitude_nm:.5g} nm, lock-in at {full.lockin_frequency_khz:.6g} kHz "
+        f"{full.lockin_amplitude_nm:.5g} nm at {full.lockin_phase_deg:.4g} deg, "
+        f"{known(full.energy_per_impact_aj, '.4g')} aJ lost per impact; {known(full.time_us_per_period, '.4g')} us to "
+        "compute a drive period."
     )
-    reasons = [f"{report.effect.name}: {report.reason}." for report in study.effects if report.reason is not None]
+    reasons = [f"{effect.name}: {effect.reason}." for effect in study.effects if effect.reason is not None]
     conclusion = "every effect that can be left out is needed."
-    if reduction.left_out:
+    if study.not_needed:
         conclusion = (
-            f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
-            f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
-            f"{known(reduction.cost, '.4g')} us per drive period."
+            f"these are not needed: {', '.join(study.not_needed)}. Without all of them the peak changes by "
+            f"{_percent(joint.peak_amplitude)}, the lock-in amplitude by {_percent(joint.lockin_amplitude)}; "
+            f"{known(study.reduced_time_us_per_period, '.4g')} us per drive period."
         )
-    table = table_of(cells, payload["effects"], form=".3g")
+    table = table_of(cells, study.effects, form=".3g")
     end = f"For amplitudes to {100.0 * study.accuracy:g} % {conclusion}"
     return [Section("", [summary, "Without the effect:", table, *reasons, end])]
 
 
 @csv_columns.register
 def _(study: EffectStudy) -> CsvColumns:
-    rows = as_json(study)["effects"]
-    changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
-    return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
+    rows = [vars(effect) | {f"change_{name}": x for name, x in vars(effect.change).items()} for effect in study.effects]
+    return {"effects.csv": columns_of(rows, [name for name in rows[0] if name != "change"] if rows else ())}
 
 
 def _percent(share: float | None) -> str:
@@ -303,14 +286,9 @@ def study_effects(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
-        ValueError: if the scene itself has no motion to compare with, an effect of `only` is not in the scene, or the
-            accuracy or the duration is not positive.
+        ValueError: if the scene itself has no motion to compare with, or an effect of `only` is not in the scene.
     """
     require_float64(scene)
-    if not 0.0 < accuracy < 1.0:
-        raise ValueError(f"`accuracy` must be between 0 and 1, but is {accuracy!r}")
-    if duration_us is not None and not duration_us > 0.0:
-        raise ValueError(f"`duration_us` must be positive, but is {duration_us!r}")
     effects = {effect.name: effect for effect in effects_in(scene)}
     for name in only or ():
         if name not in effects:
@@ -323,31 +301,37 @@ def study_effects(
         full = view.observed(scene)
     if full.reading is None:
         raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
-    reports = []
+    reports: dict[str, EffectReport] = {}
     for number, effect in enumerate(chosen, 1):
         report(number, len(chosen) + 2)
-        if effect.required is not None:
-            reports.append(EffectReport(effect, Change(), f"required: {effect.required}", None))
-            continue
-        without = view.observed(effect.without(scene))
-        reports.append(EffectReport(effect, *view.change(full, without), view.cost(without)))
+        told: tuple[Any, ...] = Change(), f"required: {effect.required}", None
+        if effect.required is None:
+            without = view.observed(effect.without(scene))
+            told = *view.change(full, without), view.cost(without)
+        reports[effect.name] = EffectReport(effect.name, effect.required is not None, *told)
     report(len(chosen) + 1, len(chosen) + 2)
-    reduction = _reduced(view, full, reports, accuracy)
-    return EffectStudy(full, view.cost(full), reports, accuracy, reduction)
+    sizes = [(each.change.of_amplitude, effects[name]) for name, each in reports.items()]
+    small = [(size, effect) for size, effect in sizes if size is not None and size < accuracy]
+    not_needed, joint_change, reduced = _reduced(view, full, small, accuracy)
+    for name in not_needed:
+        reports[name] = replace(reports[name], needed=False)
+    reading = replace(full.reading, time_us_per_period=view.cost(full))
+    cost = view.cost(reduced)
+    return EffectStudy(reading, [*reports.values()], accuracy, not_needed, joint_change, reduced.scene, cost)
 
 
-def _reduced(view: "_View", full: Observed, reports: list[EffectReport], accuracy: float) -> Reduction:
+def _reduced(
+    view: "_View", full: Observed, sizes: Sequence[tuple[float, SceneEffect]], accuracy: float
+) -> tuple[list[str], Change, Observed]:
     """Leave out effects from the smallest on, as long as all together change the amplitudes by less."""
-    sizes = [(report.change.of_amplitude, report.effect) for report in reports]
-    candidates = sorted(((size, effect) for size, effect in sizes if size is not None), key=lambda each: each[0])
     reduced, left_out, change = full, [], Change(0.0, 0.0, 0.0, 0.0)
-    for size, effect in candidates:
-        smaller = view.observed(effect.without(reduced.scene)) if size < accuracy else full._replace(reading=None)
+    for _, effect in sorted(sizes, key=lambda each: each[0]):
+        smaller = view.observed(effect.without(reduced.scene))
         joint, _ = view.change(full, smaller)
         if joint.of_amplitude is not None and joint.of_amplitude < accuracy:
             reduced, change = smaller, joint
             left_out.append(effect.name)
-    return Reduction(tuple(left_out), change, reduced.scene, view.cost(reduced))
+    return left_out, change, reduced
 
 
 class _View:
@@ -384,7 +368,7 @@ class _View:
             first = float(self.start.time_us)
             fifth = last_fifth(first, first + self.duration_us, self.drive)
             window = fifth.from_us, fifth.to_us
-        return found._replace(reading=_read(scene, motion, window, _periods_read(found)))
+        return found._replace(reading=_read(found, motion, window))
 
     def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
         """Return what changed, and what there is to say."""
@@ -405,7 +389,7 @@ class _View:
         if kinds[0] == kinds[1]:
             return change, None
         reason = f"without it: another orbit, {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
-        return change._replace(lockin_phase_deg=None), reason
+        return replace(change, lockin_phase_deg=None), reason
 
     def cost(self, observed: Observed) -> float | None:
         """Return what following a scene costs, its steady orbit if there is one; one program has one cost."""
@@ -439,9 +423,10 @@ def _periods_read(observed: Observed) -> int:
     return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
 
 
-def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], periods: int) -> Reading:
+def _read(observed: Observed, simulation: Simulation, window: tuple[float, float]) -> Reading:
     """Return a reading of a simulation over a window, by a lock-in at the drive's frequency over some periods."""
-    motion = MotionWindow(DensePath(scene, simulation), *window, periods)
+    scene, orbit = observed.scene, observed.orbit
+    motion = MotionWindow(DensePath(scene, simulation), *window, _periods_read(observed))
     lost, line = motion.dense.contacts.energy_lost_aj[motion.begun], motion.height.at_response
     return Reading(
         peak_amplitude_nm=motion.height.largest,
@@ -450,4 +435,5 @@ def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], per
         lockin_phase_deg=line.phase_deg,
         energy_per_impact_aj=float(lost.mean()) if lost.size else None,
         impacts=int(lost.size),
+        drive_periods=None if orbit is None else orbit.periods,
     )
