@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, save_scene
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import start_of, state
@@ -110,13 +110,13 @@ def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response():
 
 
 def test_all_effects_are_named():
-    platform = Platform(4.0, 181.8, 0.0, 1e-3, Tone(1.0, 47.0))
-    base, force = BaseDrive(0.1, 90.0, 0.0, Tone(0.0, 33.0)), ForceDrive(0.1, 90.0)
+    platform = Platform(4.0, 181.8)
+    base, force = BaseDrive(0.1, 90.0), ForceDrive(0.1, 90.0)
     scene = Scene(Cantilever(90.0, 40.0), platform, Contact.paper(structural_amplitude_n_per_m=0.0), base, force)
     effects = {effect.name: effect for effect in effects_in(scene)}
     assert set(effects) == {
-        *("capillary", "structural", "core", "viscous", "jkr", "air_damping", "ramp"),
-        *("second_frequency", "base_drive", "base_second_frequency", "force_drive"),
+        *("capillary", "structural", "core", "viscous", "jkr", "air_damping"),
+        *("base_drive", "force_drive"),
     }
     assert {name for name, effect in effects.items() if effect.required} == {"core", "jkr"}
     assert effects["base_drive"].without(scene).base is None

@@ -27,9 +27,9 @@ def effects(
 
     Each effect is left out in turn, and the steady motion is compared with that of the full scene: peak and lock-in
     amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the scene's default
-    one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared. Costs are times
-    to compute a drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and
-    reduced.toml: the scene, and its start, without the effects that the accuracy does not need.
+    one; a motion that does not repeat (a ramp, several frequencies, chaos) is refused. Costs are times to compute a
+    drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and reduced.toml: the
+    scene, and its start, without the effects that the accuracy does not need.
 
     Args:
         session: for progress.

@@ -1,9 +1,8 @@
 """What each effect of a scene changes and costs, and which effects a wanted accuracy does not need.
 
 An effect is left out: it is absent from the compiled program, not multiplied by zero. The scene without it is followed
-from the same start, and its steady orbit (where nothing repeats, the last fifth of the duration) is read as that of the
-full scene is. What the two readings differ by is what the effect changes; what the programs' times differ by is what
-it costs.
+from the same start, and its steady orbit is read as that of the full scene is. What the two readings differ by is what
+the effect changes; what the programs' times differ by is what it costs.
 """
 
 import statistics
@@ -24,11 +23,9 @@ from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import WHY_REQUIRED
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import MotionWindow
-from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
-from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.settle import last_fifth
+from afm_jax.motion.periodic import Orbit, follow_to_orbit
+from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import DensePath
@@ -73,17 +70,12 @@ def effects_in(scene: Scene) -> list[SceneEffect]:
     effects = _of_interaction(scene.interaction)
     if scene.cantilever.quality_factor is not None:
         effects.append(_putting("air_damping", "cantilever.quality_factor"))
-    if scene.platform.offset_rate_nm_per_us != 0.0:
-        effects.append(_putting("ramp", "platform.offset_rate_nm_per_us", 0.0))
     driven = {name: getattr(scene, name) for name in _AMPLITUDES if getattr(scene, name) is not None}
     moving = [name for name, drive in driven.items() if getattr(drive, _AMPLITUDES[name]) != 0.0]
-    for name, drive in driven.items():
-        own = "" if name == "platform" else f"{name}_"
-        if drive.second is not None:
-            effects.append(_putting(f"{own}second_frequency", f"{name}.second"))
-        if own:
+    for name in driven:
+        if name != "platform":
             only = "it is the scene's only drive" if moving == [name] else None
-            effects.append(_putting(f"{own}drive", name)._replace(required=only))
+            effects.append(_putting(f"{name}_drive", name)._replace(required=only))
     return effects
 
 
@@ -142,7 +134,7 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a motion shows in a window of time, in a few numbers."""
+    """What a steady orbit shows, in a few numbers."""
 
     peak_amplitude_nm: float
     """Largest height above the rest position."""
@@ -155,19 +147,18 @@ class Reading:
     energy_per_impact_aj: float | None
     """None without impacts."""
     impacts: int
-    drive_periods: int | None = None
-    """Of the steady orbit; None: there is none, the window is the last fifth of the duration."""
+    drive_periods: int
     time_us_per_period: float | None = None
     """What computing a drive period takes: the median of several runs."""
 
 
 class Observed(NamedTuple):
-    """What a scene shows; without a reading the reason says why."""
+    """A scene, its steady orbit and what that shows; without an orbit the reason says why."""
 
     scene: Scene
+    orbit: Orbit | None
+    reason: str | None
     reading: Reading | None
-    reason: str | None = None
-    orbit: Orbit | None = None
 
 
 @dataclass(frozen=True)
@@ -212,8 +203,7 @@ class EffectStudy(Result):
 
 @as_json.register
 def _(study: EffectStudy) -> dict[str, Any]:
-    compared = "last fifth of the duration" if study.full.drive_periods is None else "steady orbits"
-    told = {"compared": compared} | vars(study)
+    told = {"compared": "steady orbits"} | vars(study)
     time = told.pop("reduced_time_us_per_period")
     return told | {"reduced": {"time_us_per_period": time, "scene": scene_tables(study.reduced)}}
 
@@ -230,10 +220,8 @@ def _(study: EffectStudy) -> list[Section]:
         "time\nus/period": "time_us_per_period:.4g",
         "": lambda effect: "required" if effect.required else "" if effect.needed else "not needed",
     }
-    window = "the last fifth of the duration; no steady orbit"
     summary = (
-        f"Full scene: {counted(full.impacts, 'impact')} in "
-        f"{window if full.drive_periods is None else counted(full.drive_periods, 'drive period')}; "
+        f"Full scene: {counted(full.impacts, 'impact')} in {counted(full.drive_periods, 'drive period')}; "
         f"peak {full.peak_amplitude_nm:.5g} nm, lock-in at {full.lockin_frequency_khz:.6g} kHz "
         f"{full.lockin_amplitude_nm:.5g} nm at {full.lockin_phase_deg:.4g} deg, "
         f"{known(full.energy_per_impact_aj, '.4g')} aJ lost per impact; {known(full.time_us_per_period, '.4g')} us to "
@@ -296,11 +284,8 @@ def study_effects(
     chosen = [effect for name, effect in effects.items() if only is None or name in only]
     view = _View(scene, start, duration_us)
     full = view.observed(scene)
-    if view.settles and full.reading is None and (full.reason or "").startswith("nothing repeats"):
-        view.settles = False
-        full = view.observed(scene)
     if full.reading is None:
-        raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
+        raise ValueError(f"the scene has no steady orbit to compare with: {full.reason}; give it another start")
     reports: dict[str, EffectReport] = {}
     for number, effect in enumerate(chosen, 1):
         report(number, len(chosen) + 2)
@@ -340,7 +325,6 @@ class _View:
     def __init__(self, scene: Scene, start: State | None, duration_us: float | None) -> None:
         """Take what the full scene says."""
         self.drive: DrivePeriod = drive_of(scene)
-        self.settles = self.drive.aperiodic is None
         self.start = default_start(scene) if start is None else start
         self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
         # compiled once for every choice of effects; numbers change without compiling again
@@ -348,35 +332,20 @@ class _View:
         self._costs: dict[Any, float] = {}
 
     def observed(self, scene: Scene) -> Observed:
-        """Return what a scene shows: its steady orbit, or the end of the duration if the full scene has none."""
-        reason = drive_of(scene).aperiodic if self.settles else why_impossible(scene)
-        if reason is not None:
-            return Observed(scene, None, reason)
-        if self.settles:
-            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, partial(self._run, scene))
-            if orbit is None:
-                return Observed(scene, None, reason)
-            begin = float(orbit.start.time_us)
-            found = Observed(scene, None, None, orbit)
-            window, motion = (begin, begin + orbit.period_us), orbit.motion
-        else:
-            run = follow_long(scene, self.start, self.duration_us)
-            motion, found = run.simulation, Observed(scene, None)
-            outcome = MotionOutcome(int(motion.outcome))
-            if run.verdict.stuck or outcome != MotionOutcome.FINISHED:
-                return found._replace(reason="the sample holds the tip" if run.verdict.stuck else outcome.sentence)
-            first = float(self.start.time_us)
-            fifth = last_fifth(first, first + self.duration_us, self.drive)
-            window = fifth.from_us, fifth.to_us
-        return found._replace(reading=_read(found, motion, window))
+        """Return what a scene shows."""
+        aperiodic, run = drive_of(scene).aperiodic, partial(self._run, scene)
+        orbit, reason = None, aperiodic
+        if aperiodic is None:
+            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, run)
+        return Observed(scene, orbit, reason, None if orbit is None else _read(scene, orbit))
 
     def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
         """Return what changed, and what there is to say."""
         before, after = full.reading, without.reading
-        if before is None or after is None:
+        if before is None or after is None or full.orbit is None or without.orbit is None:
             return Change(), None if without.reason is None else f"without it: {without.reason}"
         # which of the N equivalent periods is locked is unknown
-        turn = 360.0 / _periods_read(full)
+        turn = 360.0 / _periods_read(full.scene, full.orbit)
         phase = (after.lockin_phase_deg - before.lockin_phase_deg + 0.5 * turn) % turn - 0.5 * turn
         lost, lost_after = before.energy_per_impact_aj, after.energy_per_impact_aj
         change = Change(
@@ -385,21 +354,20 @@ class _View:
             phase,
             lost_after / lost - 1.0 if lost and lost_after is not None else None,
         )
-        kinds = [None if one.orbit is None else (one.orbit.impacts, one.orbit.periods) for one in (full, without)]
+        kinds = [(orbit.impacts, orbit.periods) for orbit in (full.orbit, without.orbit)]
         if kinds[0] == kinds[1]:
             return change, None
         reason = f"without it: another orbit, {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
         return replace(change, lockin_phase_deg=None), reason
 
     def cost(self, observed: Observed) -> float | None:
-        """Return what following a scene costs, its steady orbit if there is one; one program has one cost."""
-        if observed.reading is None:
+        """Return what following a scene's steady orbit costs; one program has one cost."""
+        if observed.orbit is None:
             return None
         structure = jax.tree.structure(observed.scene)
         if structure not in self._costs:
-            start = self.start if observed.orbit is None else observed.orbit.start
             duration = min(_PERIODS_TIMED * self.drive.period_us, self.duration_us)
-            arguments = _arguments(observed.scene, start, duration)
+            arguments = _arguments(observed.scene, observed.orbit.start, duration)
             seconds = statistics.median(seconds_a_call(self._follow, *arguments, repetitions=_REPETITIONS))
             self._costs[structure] = 1e6 * seconds * self.drive.period_us / duration
         return self._costs[structure]
@@ -413,20 +381,19 @@ def _arguments(scene: Scene, start: State, duration_us: float) -> tuple[Scene, S
     return scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float)
 
 
-def _periods_read(observed: Observed) -> int:
+def _periods_read(scene: Scene, orbit: Orbit) -> int:
     """Return how many drive periods a period of what the lock-in reads has.
 
-    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency, and
-    where no orbit is steady.
+    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency.
     """
-    scene, orbit = observed.scene, observed.orbit
-    return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
+    return orbit.periods if scene.base is None and scene.force is None else 1
 
 
-def _read(observed: Observed, simulation: Simulation, window: tuple[float, float]) -> Reading:
-    """Return a reading of a simulation over a window, by a lock-in at the drive's frequency over some periods."""
-    scene, orbit = observed.scene, observed.orbit
-    motion = MotionWindow(DensePath(scene, simulation), *window, _periods_read(observed))
+def _read(scene: Scene, orbit: Orbit) -> Reading:
+    """Return a reading of an orbit, by a lock-in at the drive's frequency over some periods."""
+    begin = float(orbit.start.time_us)
+    dense = DensePath(scene, orbit.motion)
+    motion = MotionWindow(dense, begin, begin + orbit.period_us, _periods_read(scene, orbit))
     lost, line = motion.dense.contacts.energy_lost_aj[motion.begun], motion.height.at_response
     return Reading(
         peak_amplitude_nm=motion.height.largest,
@@ -435,5 +402,5 @@ def _read(observed: Observed, simulation: Simulation, window: tuple[float, float
         lockin_phase_deg=line.phase_deg,
         energy_per_impact_aj=float(lost.mean()) if lost.size else None,
         impacts=int(lost.size),
-        drive_periods=None if orbit is None else orbit.periods,
+        drive_periods=orbit.periods,
     )

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import tempfile
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -596,14 +595,6 @@ def _make(store: Path, plan: SweepPlan, results: Columns) -> None:
             zarr.consolidate_metadata(str(fresh))
 
 
-class SweepRun(NamedTuple):
-    """What a run over a sweep did: chunks kept from before and those computed now, and its seconds."""
-
-    kept: int
-    computed: int
-    seconds: float
-
-
 Progress = Callable[[int, int], object]
 """Called with how many of how many points are done."""
 
@@ -615,11 +606,14 @@ def run_plan(
     workers: int = 1,
     scheduler: str | None = None,
     report: Progress | None = None,
-) -> SweepRun:
-    """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
+) -> tuple[int, int]:
+    """Compute what a folder does not hold yet of a sweep; return how many chunks it held, and how many are new.
+
+    Arguments and errors are as of `sweep`.
+    """
     import zarr  # noqa: PLC0415 (an extra package)
 
-    begin, regions, done = time.monotonic(), plan.regions(), 0
+    regions, done = plan.regions(), 0
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -646,7 +640,7 @@ def run_plan(
     except OSError as error:
         what = f"{error.strerror or error}: {kept + done} of {len(regions)} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
-    return SweepRun(kept, done, time.monotonic() - begin)
+    return kept, done
 
 
 def _results(
