@@ -8,6 +8,7 @@ import collections.abc
 import dataclasses
 import functools
 import inspect
+import itertools
 import operator
 import os
 import sys
@@ -24,7 +25,8 @@ def as_parameter(value: Any) -> Any:
     """Return a parameter as a floating-point array; arrays that are floating-point already keep their precision.
 
     Python numbers become arrays of the default precision and never weakly typed, so that one compiled program serves
-    numbers and arrays alike. What is no real number stays as it is, for `check_parameter` to refuse by its name.
+    numbers and arrays alike. None (an absent effect) stays, and so does what is no real number, which
+    `check_parameter` refuses by its name.
     """
     if not isinstance(value, float) and not _is_real(value):
         # `check_parameter` names it
@@ -41,11 +43,6 @@ def as_argument(value: Any) -> Any:
 
     array = jnp.asarray(value)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array * 1.0
-
-
-def as_optional_parameter(value: Any) -> Any:
-    """Return `as_parameter(value)`, or None where the effect is absent."""
-    return None if value is None else as_parameter(value)
 
 
 def is_traced(value: Any) -> bool:
@@ -228,12 +225,10 @@ def _misfit_of_several(kind: Any, parts: tuple[Any, ...], value: Any) -> str:
     """Return what a value must be that is no list or tuple of such elements; nothing where it is."""
     if isinstance(value, str) or not (isinstance(value, collections.abc.Sequence) or is_array(value)):
         return "a list"
-    if kind is tuple and Ellipsis not in parts:
-        if len(value) != len(parts):
-            return f"{len(parts)} values"
-        pairs = zip(parts, value, strict=True)
-    else:
-        pairs = ((parts[0] if parts else Any, element) for element in value)
+    is_fixed = kind is tuple and Ellipsis not in parts
+    if is_fixed and len(value) != len(parts):
+        return f"{len(parts)} values"
+    pairs = zip(parts if is_fixed else itertools.repeat(parts[0] if parts else Any), value, strict=False)
     # a number that is none is of the right kind: what takes the list says what it must be
     inner = next((must for part, each in pairs if (must := _misfit(part, each)) and not _is_nan(each)), "")
     return f"a list, each {inner}" if inner else ""

@@ -2,15 +2,13 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.simulate import simulate
-from afm_jax.motion.start import start_of, state
+from afm_jax.motion.start import start_of
 from afm_jax.scenefile.scenefile import read_scene
 from afm_jax.studies.effects import Change, effects_in, study_effects
 from tests.answers import answer, table
@@ -122,24 +120,6 @@ def test_all_effects_are_named():
     assert effects["base_drive"].without(scene).base is None
     assert effects["force_drive"].without(scene).force is None
     assert "capillary" not in effects["capillary"].without(scene).interaction.effects
-
-
-def test_a_scene_pays_only_for_its_effects():
-    """A left-out effect is absent from the program, which has fewer operations; a number of a law is in its formula.
-
-    Forces of a contact: `test_contact_effects_cost`.
-    """
-
-    def operations(scene: Scene) -> float:
-        begin = state(0.3, float(scene.platform.position(0.3)) + 10.0, 60.0)
-        program = jax.jit(lambda one: simulate(one, begin, 10.0, max_contacts=8)).lower(scene)
-        return (program.cost_analysis() or {})["flops"]
-
-    scene = law_scene()
-    whole = operations(scene)
-    known = {effect.name: effect for effect in effects_in(scene)}
-    assert operations(known["adhesion"].without(scene)) == whole
-    assert operations(known["delay"].without(scene)) < whole
 
 
 @pytest.mark.slow
