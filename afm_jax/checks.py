@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import inspect
 import itertools
-import operator
 import os
 import sys
 import types
@@ -240,13 +239,7 @@ def is_array(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    if isinstance(value, bool | np.bool_):
-        return False
-    try:
-        operator.index(value)
-    except TypeError:
-        return False
-    return True
+    return _is_real(value) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iu"
 
 
 def _is_nan(value: Any) -> bool:

@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from afm_jax.checks import checked, is_array
+from afm_jax.checks import checked, is_array, is_traced
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__
 from afm_jax.whole_files import read_whole, write_whole
@@ -65,12 +65,7 @@ def is_record(value: Any) -> bool:
 
 def is_abstract(value: Any) -> bool:
     """Say whether a value is an array without numbers: traced by JAX, or a shape."""
-    if not is_array(value) or isinstance(value, np.ndarray | np.generic):
-        return False
-    from jax import ShapeDtypeStruct  # noqa: PLC0415 (reading a table needs no JAX)
-    from jax.core import Tracer  # noqa: PLC0415
-
-    return isinstance(value, Tracer | ShapeDtypeStruct)
+    return is_array(value) and (is_traced(value) or not hasattr(value, "__array__"))
 
 
 @singledispatch

@@ -197,7 +197,7 @@ class AccuracyProblem:
     def _with_slopes(self, setting: Any) -> tuple[Values, Slopes]:
         """Return values and slopes, by a program that compiles quickly: it is not timed."""
         value = partial(value_and_slopes, partial(self.solve, setting))
-        return jax.tree.map(np.asarray, compiled_for(value, self.at, options=quick_options(0))[0](self.at))
+        return jax.tree.map(np.asarray, compiled_for(value, self.at, options=quick_options(0))(self.at))
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
         """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""
@@ -215,7 +215,7 @@ class AccuracyStudy(Result):
     Attributes:
         problem: its name.
         rows: each with of ("value" or "gradient"), method, setting, microseconds (of one impact or contact), error,
-            compile_s, and reason where there is no error.
+            and reason where there is no error.
         value_of: what the value is.
         reference: what errors are taken against.
         reference_error: its own error of the value.
@@ -230,7 +230,7 @@ class AccuracyStudy(Result):
     reference_gradient_error: float
 
 
-_COLUMNS = ("of", "method", "setting", "microseconds", "error", "compile_s")
+_COLUMNS = ("of", "method", "setting", "microseconds", "error")
 
 
 @sections.register
@@ -277,11 +277,12 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> Accura
     return AccuracyStudy(problem, rows, solved.what, solved.reference, *solved.doubt)
 
 
-def _row(of: str, method: str, setting: str, seconds: float, error: float, **more: Any) -> Row:
-    known = math.isfinite(error)
-    row = {"of": of, "method": method, "setting": setting, "microseconds": 1e6 * seconds if known else None}
-    reason = {} if known else {"reason": "the tip is captured, or the integrator gave up"}
-    return row | {"error": error if known else None} | reason | more
+def _row(of: str, method: str, setting: str, seconds: float, error: float) -> Row:
+    row = {"of": of, "method": method, "setting": setting, "microseconds": 1e6 * seconds, "error": error}
+    if math.isfinite(error):
+        return row
+    none = {"microseconds": None, "error": None, "reason": "the tip is captured, or the integrator gave up"}
+    return row | none
 
 
 def _compiled_rows(
@@ -301,10 +302,10 @@ def _compiled_rows(
             value = solve if number else partial(solve, setting)
             both = value, jax.jacfwd(value, argnums=len(arguments) - 1)
             programs = [compiled_for(each, *arguments, options=problem.options) for each in both]
-        errors = problem.errors(*(run(*arguments) for run, _ in programs))
-        for of, (run, compile_s), error in zip(("value", "gradient"), programs, errors, strict=True):
+        errors = problem.errors(*(run(*arguments) for run in programs))
+        for of, run, error in zip(("value", "gradient"), programs, errors, strict=True):
             seconds = min(seconds_a_call(run, *arguments, repetitions=repetitions))
-            yield _row(of, method, name, seconds / events, error, compile_s=compile_s)
+            yield _row(of, method, name, seconds / events, error)
 
 
 def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters: Parameters) -> Values:

@@ -32,7 +32,6 @@ from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import DRIVEN_NUMBERS, ORBIT_NUMBERS, highest_orbits
-from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
@@ -248,7 +247,7 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
             raise ValueError("`accuracy` is about resolved contacts, and this scene has none: leave `accuracy` out")
         if not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
             raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
-        chosen["accuracy"] = accuracy
+        chosen |= {"accuracy": accuracy} if "accuracy" in usual else {}
     if given.get("start"):
         if "start" not in usual:
             raise ValueError(f"a start is of use for simulations alone: leave it out for {what!r}")
@@ -272,31 +271,10 @@ def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
     return batch_family(scene, paths) if paths else lambda _: scene
 
 
-def _one_by_one(record: Callable[[dict[str, float]], Columns], nothing: Columns) -> Callable[[Columns], Columns]:
-    """Return a function of columns from one of a point, whose neighbours would tell in last digits.
-
-    Args:
-        record: the results at a point.
-        nothing: what stands for those that it lacks, and for all where it refuses the point: `MESSAGE` says why then.
-    """
-
-    def at(row: dict[str, float]) -> Columns:
-        try:
-            return nothing | record(row)
-        except ValueError as error:
-            return nothing | {MESSAGE: str(error)}
-
-    def work(columns: Columns) -> Columns:
-        rows = [at(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-        return {name: [row[name] for row in rows] for name in nothing}
-
-    return work
-
-
-def _orbits(
-    scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...] = (1,), accuracy: float = CHART_ACCURACY
-) -> Recorder:
+def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...] = (1,)) -> Recorder:
     """Record the stable single-impact orbits of scenes; of several of one order the highest."""
+    if isinstance(scene.interaction, Contact):
+        raise ValueError("'orbits' are those of laws: for a resolved contact record 'simulation', or make a chart")  # noqa: TRY004
     sample_driven(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
@@ -304,20 +282,6 @@ def _orbits(
         if "frequency" in path:
             # a little aside: says why not, where another part has the same frequency
             sample_driven(scene_batch(scene, {path: np.array([1.001 * parameter_values(scene)[path]])}))
-    extra = {"order": orders}
-    if isinstance(scene.interaction, Contact):
-        numbers, no = np.full(len(orders), math.nan), np.zeros(len(orders), bool)
-        nothing = dict.fromkeys(("peak_amplitude_nm", "largest_multiplier"), numbers)
-        # unresolved: the law closest to the contact has an orbit, but none was found
-        nothing |= dict.fromkeys(("stable", "admissible", "unresolved"), no) | {MESSAGE: ""}
-
-        def record(row: dict[str, float]) -> Columns:
-            scenes = scene_batch(scene, {name: np.array([value]) for name, value in row.items()})
-            found = single_contact_orbits(scenes, orders, accuracy=accuracy)
-            return {name: column[:, 0] for name, column in found.items()}
-
-        return Recorder(_one_by_one(record, nothing), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
-
     made = _scenes(scene, paths)
 
     def record_batch(columns: Columns) -> Columns:
@@ -333,7 +297,7 @@ def _orbits(
     # what a processor's cache holds, or what fills an accelerator; blocks of one shape have one program
     block = 1024 if jax.default_backend() == "cpu" else 1 << 16
     work = partial(in_blocks, jax.jit(record_batch), block=block, widths=(block,))
-    return Recorder(work, points, ("peak_amplitude_nm", "stable_orbits"), extra)
+    return Recorder(work, points, ("peak_amplitude_nm", "stable_orbits"), {"order": orders})
 
 
 def _codes(kinds: Any) -> dict[int, str]:
@@ -408,8 +372,7 @@ def _simulation(
     nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {"outcome": _REFUSED, MESSAGE: ""}
     nothing |= {EXTRAPOLATED: False} if isinstance(scene.interaction, TabulatedLaw) else {}
 
-    def record(row: dict[str, float]) -> Columns:
-        one = family(*row.values())
+    def record(one: Scene) -> Columns:
         longest = periods * drive_of(one).period_us
         run = follow_long(one, start_of(one, start), longest, until_settled=True, accuracy=accuracy)
         found, verdict = run.simulation, run.verdict
@@ -432,9 +395,19 @@ def _simulation(
         told = {} if seen.window.responses else {MESSAGE: TOO_SHORT}
         return results | {name: value for name, value in values.items() if value is not None} | told
 
+    def at(*values: float) -> Columns:
+        try:
+            return nothing | record(family(*values))
+        except ValueError as error:
+            return nothing | {MESSAGE: str(error)}
+
+    def work(columns: Columns) -> Columns:
+        # one by one: neighbours would tell in last digits
+        rows = [at(*values) for values in zip(*columns.values(), strict=True)]
+        return {name: [row[name] for row in rows] for name in nothing}
+
     words = {"outcome": {_REFUSED: "not_possible"} | _codes(MotionOutcome)}
-    work, shown = _one_by_one(record, nothing), ("peak_amplitude_nm", "lockin_amplitude_nm")
-    return Recorder(work, 16, shown, words=words, alone=True)
+    return Recorder(work, 16, ("peak_amplitude_nm", "lockin_amplitude_nm"), words=words, alone=True)
 
 
 _RECORDERS: dict[str, Callable[..., Recorder]] = {
