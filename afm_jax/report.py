@@ -8,8 +8,8 @@ the page.
 
 import enum
 import importlib
-import math
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -128,7 +128,7 @@ def _cell(row: Any, cell: Cell, form: str) -> str:
     return value if isinstance(value, str) else known(value, form)
 
 
-def text_of(*results: Any, width: float = math.inf) -> str:
+def text_of(*results: Any, width: int = sys.maxsize) -> str:
     """Return results as text; pictures, captions and headings are the page's.
 
     Args:
@@ -144,7 +144,7 @@ def text_of(*results: Any, width: float = math.inf) -> str:
     return in_unit("\n\n".join("\n".join(block) for block in blocks if block))
 
 
-def lines_of(*parts: Any, width: float = math.inf) -> list[str]:
+def lines_of(*parts: Any, width: int = sys.maxsize) -> list[str]:
     """Return the lines of parts, or of whole results, in a terminal so wide; none of a part that holds nothing."""
     lines: list[str] = []
     for part in parts:

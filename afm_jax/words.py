@@ -3,6 +3,7 @@
 import difflib
 import math
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from typing import SupportsFloat
 
@@ -136,7 +137,7 @@ def is_words(cells: Iterable[str]) -> bool:
 _WORD = re.compile(r"^[^\W\d_]|[^\W\d_]{2}")
 
 
-def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], width: float = math.inf) -> list[str]:
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], width: int = sys.maxsize) -> list[str]:
     r"""Return lines of a table, indented, columns as wide as what is in them: words to the left, numbers to the right.
 
     Args:
