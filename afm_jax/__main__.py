@@ -2,8 +2,6 @@
 
 import gc
 import os
-import signal
-from typing import Any
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """What BLAS libraries read their number of threads from, when they are loaded."""
@@ -20,21 +18,12 @@ def run() -> None:
     gc.set_threshold(*_COLLECTIONS)
     for name in _THREADS:
         os.environ.setdefault(name, os.environ.get("OMP_NUM_THREADS", "1"))
-    # a shell starts what runs in the background with interrupts ignored
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if heard:
-        signal.signal(signal.SIGINT, _end)
-    from afm_jax.cli.main import main  # noqa: PLC0415
-
-    if heard:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        from afm_jax.cli.main import main  # noqa: PLC0415
+    except KeyboardInterrupt:
+        os.write(2, b"afm-jax: interrupted\n")
+        raise SystemExit(130) from None
     main(prog_name="afm-jax")
-
-
-def _end(_number: int, _frame: Any) -> None:
-    """End the program at once: nothing has been begun."""
-    os.write(2, b"afm-jax: interrupted\n")
-    os._exit(130)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import collections.abc
 import dataclasses
 import functools
 import inspect
-import operator
+import itertools
 import os
 import sys
 import types
@@ -24,7 +24,8 @@ def as_parameter(value: Any) -> Any:
     """Return a parameter as a floating-point array; arrays that are floating-point already keep their precision.
 
     Python numbers become arrays of the default precision and never weakly typed, so that one compiled program serves
-    numbers and arrays alike. What is no real number stays as it is, for `check_parameter` to refuse by its name.
+    numbers and arrays alike. None (an absent effect) stays, and so does what is no real number, which
+    `check_parameter` refuses by its name.
     """
     if not isinstance(value, float) and not _is_real(value):
         # `check_parameter` names it
@@ -41,11 +42,6 @@ def as_argument(value: Any) -> Any:
 
     array = jnp.asarray(value)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array * 1.0
-
-
-def as_optional_parameter(value: Any) -> Any:
-    """Return `as_parameter(value)`, or None where the effect is absent."""
-    return None if value is None else as_parameter(value)
 
 
 def is_traced(value: Any) -> bool:
@@ -161,21 +157,14 @@ def checked(function: Function) -> Function:
         TypeError: by the function, naming the argument, what it must be and what it is.
     """
     signature = inspect.signature(function)
-    hints: dict[str, Any] = {}
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        if not hints:
-            several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-            for name, parameter in signature.parameters.items():
-                hints[name] = Any if parameter.kind in several else _resolved(parameter.annotation, function)
-        try:
-            given = signature.bind(*arguments, **named).arguments
-        except TypeError:
-            # what is missing or too much Python itself says best
-            return function(*arguments, **named)
-        for name, value in given.items():
-            check_kind(name, value, hints[name])
+        several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        for name, value in signature.bind(*arguments, **named).arguments.items():
+            parameter = signature.parameters[name]
+            if parameter.kind not in several:
+                check_kind(name, value, _resolved(parameter.annotation, function))
         return function(*arguments, **named)
 
     return cast("Function", call)
@@ -208,37 +197,23 @@ def _misfit(kind: Any, value: Any) -> str:
     if kind is Any or isinstance(kind, TypeVar | str) or is_traced(value):
         return ""
     parts = get_args(kind)
-    if get_origin(kind) not in (Union, types.UnionType):
-        return _misfit_of_one(get_origin(kind) or kind, parts, value)
-    words = []
-    if complex in parts:
-        # true, false and complex numbers are among JAX's numbers, but none here
-        words = ["" if _is_real(value) else "a real number or an array of them"]
-        parts = tuple(part for part in parts if part is type(None))
-    words += [_misfit(part, value) for part in parts]
-    return "" if "" in words else " or ".join(dict.fromkeys(words))
-
-
-def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noqa: PLR0911
-    """Return what a value must be that is not of a class, with what stands in its brackets; nothing where it is."""
-    simple = _SIMPLE.get(kind)
-    if simple is not None:
-        return "" if simple[1](value) else simple[0]
+    kind = get_origin(kind) or kind
+    if kind in (Union, types.UnionType):
+        # what JAX takes for a number; true, false and complex numbers are among it, but none here
+        parts = tuple(part for part in parts if part in (complex, type(None))) if complex in parts else parts
+        words = [_misfit(part, value) for part in parts]
+        return "" if "" in words else " or ".join(dict.fromkeys(words))
     if kind is Literal:
         return "" if value in parts else f"one of {', '.join(map(repr, parts))}"
-    if hasattr(kind, "array_type"):
-        return "" if is_array(value) or _is_real(value) else "an array of real numbers"
     if kind in (list, tuple, collections.abc.Sequence):
         return _misfit_of_several(kind, parts, value)
-    if kind in (dict, collections.abc.Mapping):
-        return "" if isinstance(value, collections.abc.Mapping) else "a dictionary"
-    if not isinstance(kind, type) or isinstance(value, kind):
-        return ""
+    must, fits = _SIMPLE.get(np.ndarray if hasattr(kind, "array_type") else kind, ("", None))
+    if fits is not None:
+        return "" if fits(value) else must
     # a named tuple may be written as a plain one
     fields = getattr(kind, "_fields", None)
-    if fields is not None and isinstance(value, tuple) and len(value) == len(fields):
-        return ""
-    return _with_article(kind.__name__)
+    is_plain = fields is not None and isinstance(value, tuple) and len(value) == len(fields)
+    return "" if is_plain or not isinstance(kind, type) or isinstance(value, kind) else _with_article(kind.__name__)
 
 
 def _with_article(name: str) -> str:
@@ -249,12 +224,10 @@ def _misfit_of_several(kind: Any, parts: tuple[Any, ...], value: Any) -> str:
     """Return what a value must be that is no list or tuple of such elements; nothing where it is."""
     if isinstance(value, str) or not (isinstance(value, collections.abc.Sequence) or is_array(value)):
         return "a list"
-    if kind is tuple and Ellipsis not in parts:
-        if len(value) != len(parts):
-            return f"{len(parts)} values"
-        pairs = zip(parts, value, strict=True)
-    else:
-        pairs = ((parts[0] if parts else Any, element) for element in value)
+    is_fixed = kind is tuple and Ellipsis not in parts
+    if is_fixed and len(value) != len(parts):
+        return f"{len(parts)} values"
+    pairs = zip(parts if is_fixed else itertools.repeat(parts[0] if parts else Any), value, strict=False)
     # a number that is none is of the right kind: what takes the list says what it must be
     inner = next((must for part, each in pairs if (must := _misfit(part, each)) and not _is_nan(each)), "")
     return f"a list, each {inner}" if inner else ""
@@ -266,13 +239,7 @@ def is_array(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    if isinstance(value, bool | np.bool_):
-        return False
-    try:
-        operator.index(value)
-    except TypeError:
-        return False
-    return True
+    return _is_real(value) and np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iu"
 
 
 def _is_nan(value: Any) -> bool:
@@ -283,7 +250,7 @@ def _is_number(value: Any) -> bool:
     return _is_real(value) and np.ndim(value) == 0 and not np.isnan(value)
 
 
-_SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
+_SIMPLE: dict[Any, tuple[str, Callable[[Any], bool] | None]] = {
     int: ("a whole number", _is_whole),
     float: ("a real number", _is_number),
     bool: ("True or False", lambda value: isinstance(value, bool | np.bool_)),
@@ -292,6 +259,10 @@ _SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     str: ("a text", lambda value: isinstance(value, str)),
     os.PathLike: ("a path", lambda value: isinstance(value, os.PathLike)),
     Path: ("a path", lambda value: isinstance(value, os.PathLike)),
+    complex: ("a real number or an array of them", _is_real),
+    np.ndarray: ("an array of real numbers", lambda value: is_array(value) or _is_real(value)),
+    dict: ("a dictionary", lambda value: isinstance(value, collections.abc.Mapping)),
+    collections.abc.Mapping: ("a dictionary", lambda value: isinstance(value, collections.abc.Mapping)),
 }
 
 _LARGEST = 1e30

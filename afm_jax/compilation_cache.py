@@ -117,24 +117,18 @@ def open_cache() -> Cache:
 
 
 def cache_folder() -> Path | None:
-    """Return where programs that this jaxlib compiles on this kind of processor are kept; None without a home."""
+    """Return where programs that this jaxlib compiles on this kind of processor are kept.
+
+    That is below XDG_CACHE_HOME or ~/.cache; None where that depends on a home folder and there is none: a user without
+    an entry in the system's list, as containers have, and without HOME; or one whose HOME is no absolute path.
+    """
     from jaxlib.version import __version__ as version  # noqa: PLC0415
 
-    folder = user_cache_folder()
-    return None if folder is None else folder / f"jaxlib-{version}-{processor_key()}"
-
-
-def user_cache_folder() -> Path | None:
-    """Return where a user keeps what programs can do without, XDG_CACHE_HOME or ~/.cache, in a folder named afm-jax.
-
-    None where that depends on a home folder and there is none: a user without an entry in the system's list, as
-    containers have, and without HOME; or one whose HOME is no absolute path.
-    """
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     with suppress(RuntimeError):
         # The specification says that a relative path there is to be ignored.
         base = base if base.is_absolute() else Path.home() / ".cache"
-    return base / "afm-jax" if base.is_absolute() else None
+    return base / "afm-jax" / f"jaxlib-{version}-{processor_key()}" if base.is_absolute() else None
 
 
 def processor_key() -> str:

@@ -9,6 +9,7 @@ the page.
 import enum
 import importlib
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -127,22 +128,24 @@ def _cell(row: Any, cell: Cell, form: str) -> str:
     return value if isinstance(value, str) else known(value, form)
 
 
-def text_of(*results: Any) -> str:
+def text_of(*results: Any, width: int = sys.maxsize) -> str:
     """Return results as text; pictures, captions and headings are the page's.
 
     Args:
         results: the first gives the title and the verdict, others only add sections.
+        width: of the lines; tables that are wider are turned.
     """
     first, *others = _sections_of(results)
-    blocks = [lines_of(first.title, *first.parts), lines_of(*_verdict(results[0]))]
-    blocks += [lines_of(*section.parts) for section in others if not section.page_only]
+    parts = [[first.title, *first.parts], _verdict(results[0])]
+    parts += [section.parts for section in others if not section.page_only]
+    blocks = [lines_of(*each, width=width) for each in parts]
     # energies have a unit of their own where no spring constant is known
     in_unit = getattr(results[0], "in_unit", str)
     return in_unit("\n\n".join("\n".join(block) for block in blocks if block))
 
 
-def lines_of(*parts: Any) -> list[str]:
-    """Return the lines of parts, or of whole results, in a terminal; none of a part that holds nothing."""
+def lines_of(*parts: Any, width: int = sys.maxsize) -> list[str]:
+    """Return the lines of parts, or of whole results, in a terminal so wide; none of a part that holds nothing."""
     lines: list[str] = []
     for part in parts:
         match part:
@@ -151,11 +154,11 @@ def lines_of(*parts: Any) -> list[str]:
             case Bullets(items, title):
                 lines += [*filter(None, [title]), *(f"  - {item}" for item in items)] if items else []
             case Table():
-                lines += text_table(part.head, part.rows) if part.rows else []
+                lines += text_table(part.head, part.rows, width) if part.rows else []
             case Picture() | None:
                 pass
             case _:
-                lines.append(str(part))
+                lines.append(text_of(part, width=width))
     return lines
 
 

@@ -49,10 +49,6 @@ class Result:
     def _repr_html_(self) -> str:
         return page_of(self, template="page.body.jinja")
 
-    def text(self) -> str:
-        """Return what `print` shows, and the command that computes this result; of one without a command its fields."""
-        return str(self)
-
     def plot(self, path: str | Path | None = None, **options: Any) -> "Figure":
         """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given.
 

@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from afm_jax.checks import checked, is_array
+from afm_jax.checks import checked, is_array, is_traced
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__
 from afm_jax.whole_files import read_whole, write_whole
@@ -65,12 +65,7 @@ def is_record(value: Any) -> bool:
 
 def is_abstract(value: Any) -> bool:
     """Say whether a value is an array without numbers: traced by JAX, or a shape."""
-    if not is_array(value) or isinstance(value, np.ndarray | np.generic):
-        return False
-    from jax import ShapeDtypeStruct  # noqa: PLC0415 (reading a table needs no JAX)
-    from jax.core import Tracer  # noqa: PLC0415
-
-    return isinstance(value, Tracer | ShapeDtypeStruct)
+    return is_array(value) and (is_traced(value) or not hasattr(value, "__array__"))
 
 
 @singledispatch
@@ -104,8 +99,7 @@ def save(result: Any, path: str | Path) -> None:
     Raises:
         ValueError: if a number in it is traced: save outside `jit`, `vmap` and `grad`.
     """
-    lines = (f"{json.dumps(key)}: {strict_json(value)}" for key, value in saved(result).items())
-    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=True)
+    write_whole(Path(path), strict_json(saved(result)) + "\n", named_by_user=True)
 
 
 @checked
@@ -158,8 +152,6 @@ def _plain(value: Any, place: str) -> Any:
         return _array(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else {"number": _number(value)}
-    if isinstance(value, complex):
-        return {"complex": [_number(value.real), _number(value.imag)]}
     if isinstance(value, bool | int | str | None):
         return value
     return str(value) if isinstance(value, Path) else _of_parts(value, place)
@@ -181,8 +173,7 @@ def _of_parts(value: Any, place: str) -> Any:
 def _array(value: Any) -> dict[str, Any]:
     array: Any = np.asarray(value)
     numbers = np.stack([array.real, array.imag], axis=-1) if array.dtype.kind == "c" else array
-    listed = numbers.tolist()
-    listed = _numbers(listed) if numbers.dtype.kind == "f" else listed
+    listed = _numbers(numbers.tolist()) if numbers.dtype.kind == "f" else numbers.tolist()
     kind = {} if isinstance(value, np.ndarray) else {"jax": True}
     return {"array": str(array.dtype), **kind, "shape": list(array.shape), "values": listed}
 
@@ -204,8 +195,6 @@ def _value(plain: Any) -> Any:  # noqa: PLR0911 (one return a kind of value)
         return _as_array(plain)
     if "number" in plain:
         return _as_number(plain["number"])
-    if "complex" in plain:
-        return complex(*map(_as_number, plain["complex"]))
     if "tuple" in plain:
         return tuple(_value(item) for item in plain["tuple"])
     if "map" in plain:

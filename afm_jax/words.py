@@ -1,11 +1,10 @@
 """Numbers and tables as a person reads them: the digits that an error warrants, a dash where nothing is known."""
 
-import contextlib
 import difflib
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextvars import ContextVar
+import sys
+from collections.abc import Iterable, Sequence
 from typing import SupportsFloat
 
 
@@ -138,15 +137,18 @@ def is_words(cells: Iterable[str]) -> bool:
 _WORD = re.compile(r"^[^\W\d_]|[^\W\d_]{2}")
 
 
-def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], width: int = sys.maxsize) -> list[str]:
     r"""Return lines of a table, indented, columns as wide as what is in them: words to the left, numbers to the right.
 
     Args:
         head: the columns' names, in one line or two; empty ones take no line.
         rows: a cell for each column.
+        width: a table of three columns or more that is wider than so many signs has a line a cell.
 
     >>> text_table(["", "value\nnm"], [["r", "0.95"], ["epsilon", "60"]])
     ['           value', '              nm', '  r         0.95', '  epsilon     60']
+    >>> text_table(["law", "value", "error"], [["r", "0.95", "0.01"], ["epsilon", "60", "2"]], 16)
+    ['  law    r', '  value  0.95', '  error  0.01', '', '  law    epsilon', '  value  60', '  error  2']
     """
     rows, heads = [*map(list, rows)], [name.split("\n") for name in head]
     depth = max(map(len, heads)) if any(head) else 0
@@ -154,33 +156,15 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*above, *rows, strict=True)]
     sides = ["<" if is_words(column) else ">" for column in zip(*rows, strict=True)] or [">"] * len(head)
     lines = [
-        "".join(f"  {cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
+        "".join(f"  {cell:{side}{wide}}" for cell, side, wide in zip(line, sides, widths, strict=True)).rstrip()
         for line in [*above, *rows]
     ]
-    if len(head) < 3 or max(map(len, lines)) <= _room.get():
+    if len(head) < 3 or max(map(len, lines)) <= width:
         return lines
     names = [" ".join(name).strip() for name in heads]
     left = max(map(len, names))
     blocks = [["", *(f"  {name:{left}}  {cell}" for name, cell in zip(names, row, strict=True))] for row in rows]
     return [line for block in blocks for line in block][1:]
-
-
-@contextlib.contextmanager
-def lines_at_most(width: int) -> Iterator[None]:
-    """Within this block a table of three columns or more that is wider than so many signs has a line a cell.
-
-    >>> with lines_at_most(16):
-    ...     text_table(["law", "value", "error"], [["r", "0.95", "0.01"], ["epsilon", "60", "2"]])
-    ['  law    r', '  value  0.95', '  error  0.01', '', '  law    epsilon', '  value  60', '  error  2']
-    """
-    before = _room.set(float(width))
-    try:
-        yield
-    finally:
-        _room.reset(before)
-
-
-_room: ContextVar[float] = ContextVar("_room", default=math.inf)
 
 
 def shown(text: str) -> str:

@@ -1,12 +1,10 @@
-"""Traces with known amplitudes: bounces in closed form, and trajectories of law scenes."""
+"""Traces with known amplitudes: bounces in closed form."""
 
 import cmath
 import math
 
 import numpy as np
 from scipy.signal import lfilter
-
-from afm_jax import Scene, single_impact_orbits
 
 FREE_KHZ = 90.0
 OMEGA = 2e-3 * np.pi * FREE_KHZ
@@ -39,25 +37,3 @@ def noisy_bounce(
     white = np.random.default_rng(seed).standard_normal(time.size)
     kept = np.asarray(lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white))
     return time, height + noise * kept, value
-
-
-def orbit_heights(scene: Scene, order: int, time: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
-    """Return the heights of the scene's stable orbit at given times, and the amplitudes that the package computes."""
-    found = single_impact_orbits(scene, order)
-    good = np.flatnonzero(np.asarray(found.exists & found.admissible & found.stable))
-    assert len(good) == 1
-    names = ("phase_rad", "velocity_after_nm_per_us", "delay_us")
-    names += ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg")
-    row = {name: float(np.asarray(getattr(found, name))[good[0]]) for name in names}
-    drive, rate = float(scene.platform.angular_frequency), float(scene.cantilever.decay_rate)
-    omega = float(scene.cantilever.angular_frequency)
-    damped = np.sqrt(omega**2 - rate**2)
-    mean, beta = float(scene.platform.offset_nm), float(scene.platform.amplitude_nm)
-    period = 2.0 * np.pi * order / drive
-    leaving = row["phase_rad"] / drive
-    begin = mean + beta * np.cos(row["phase_rad"])
-    since = np.mod(time - leaving, period)
-    sine = (row["velocity_after_nm_per_us"] + rate * begin) / damped * np.sin(damped * since)
-    flight = np.exp(-rate * since) * (begin * np.cos(damped * since) + sine)
-    # in contact, for the collision delay, the tip is taken to be on the platform
-    return np.where(since <= period - row["delay_us"], flight, mean + beta * np.cos(drive * time)), row

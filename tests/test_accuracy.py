@@ -66,12 +66,12 @@ def test_law_scenes_are_measured_however_they_are_driven(scene: str, tmp_path: P
         name = str(tmp_path / "forced.toml")
         save_scene(FORCED, name)
     found = accuracy.measured(name, contacts=3, quick=True)
-    for row in found["rows"]:
+    for row in found.rows:
         assert "reason" not in row
         coarse = row["setting"] == "root tolerance 0.1 us"
         # times of 20 us; the slope grows where the tip is slow
         assert row["error"] < (1.0 if coarse else 1e-4 if row["of"] == "gradient" else 1e-6), row
-    assert {row["method"] for row in found["rows"]} == {"afm-jax", "SciPy DOP853", "Diffrax Dopri8"}
+    assert {row["method"] for row in found.rows} == {"afm-jax", "SciPy DOP853", "Diffrax Dopri8"}
 
 
 @pytest.mark.slow

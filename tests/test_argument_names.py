@@ -30,12 +30,6 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         ("read", "abc.csv"),
         "say --columns offset_nm=a:nm,lockin_amplitude_nm=b:nm,phase_lag_deg=c:deg",
     ),
-    "a table's Q": (
-        lambda path: fitting.invert(fitting.read_table(path / "no_quality.csv")),
-        "give `quality_factor=40, quality_factor_error=2` (",
-        ("invert", "no_quality.csv"),
-        "give --quality-factor '40 +- 2' (",
-    ),
     "a parameter's value": (
         lambda _: model_parameters("law", fixed={"r": 3.0}),
         "`fixed`: r must lie between 0.01 and 1, but is 3.0",
@@ -51,7 +45,6 @@ def test_python_is_told_of_arguments_and_the_command_line_of_options(
 ):
     monkeypatch.chdir(tmp_path)
     Path("abc.csv").write_text(separated({"a": OFFSET, "b": AMPLITUDE, "c": LAG}, ";"), "utf-8")
-    Path("no_quality.csv").write_text(re.sub("# quality_factor.*\n", "", EXAMPLE.read_text("utf-8")), "utf-8")
     call, in_python, command, in_the_shell = CALLS[name]
     with pytest.raises(ValueError, match=re.escape(in_python)):
         call(tmp_path)

@@ -77,18 +77,6 @@ def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any]):
     assert not np.allclose(batch[0], batch[1])
 
 
-@pytest.mark.parametrize("function", OBJECTS[:3])
-def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any], monkeypatch: pytest.MonkeyPatch):
-    double = np.asarray(function(scenes()[0]))
-    monkeypatch.setattr("afm_jax.checks._NARROW", set())
-    narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scenes()[0])
-    single = np.asarray(function(narrow))
-    assert single.dtype == np.float32
-    assert np.all(np.isfinite(single))
-    # 6e-8 of phases of 10 rad and lengths of 100 nm, stretched by up to three impacts.
-    np.testing.assert_allclose(single, double, rtol=3e-3 if function is three_impacts else 3e-4)
-
-
 def built_in_many_ways() -> list[tuple[Scene, Any, Any]]:
     """Return scenes of one structure, their numbers given as Python, NumPy and JAX numbers, with a start."""
     ways: list[tuple[Scene, Any, Any]] = []

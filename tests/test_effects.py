@@ -2,15 +2,13 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, save_scene
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.simulate import simulate
-from afm_jax.motion.start import start_of, state
+from afm_jax.motion.start import start_of
 from afm_jax.scenefile.scenefile import read_scene
 from afm_jax.studies.effects import Change, effects_in, study_effects
 from tests.answers import answer, table
@@ -42,7 +40,7 @@ def orbit_of(scene: Scene):
 
 
 def by_name(study) -> dict[str, Any]:
-    return {report.effect.name: report for report in study.effects}
+    return {report.name: report for report in study.effects}
 
 
 def amplitudes(change: Change) -> np.ndarray:
@@ -71,16 +69,16 @@ def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_st
 
 @pytest.mark.slow
 def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
-    reports, reduction = by_name(law_study), law_study.reduction
-    expected = orbit_of(reduction.scene) / orbit_of(law_scene()) - 1.0
-    np.testing.assert_allclose(amplitudes(reduction.change), expected[:2], rtol=1e-5, atol=1e-7)
-    assert set(reduction.left_out) == {"delay_corrections", "viscous_loss", "restitution"}
-    assert size_of(reduction.change) < ACCURACY
+    reports = by_name(law_study)
+    expected = orbit_of(law_study.reduced) / orbit_of(law_scene()) - 1.0
+    np.testing.assert_allclose(amplitudes(law_study.joint_change), expected[:2], rtol=1e-5, atol=1e-7)
+    assert set(law_study.not_needed) == {"delay_corrections", "viscous_loss", "restitution"}
+    assert size_of(law_study.joint_change) < ACCURACY
     # adhesion alone changes 2.01 %, which the accuracy would allow; with the others it does not
     assert size_of(reports["adhesion"].change) < ACCURACY
     # numbers cost nothing, a delay does
-    costs = {name: reports[name].cost for name in ("restitution", "adhesion", "viscous_loss", "delay")}
-    assert [name for name, cost in costs.items() if cost != law_study.cost] == ["delay"]
+    costs = {name: reports[name].time_us_per_period for name in ("restitution", "adhesion", "viscous_loss", "delay")}
+    assert [name for name, cost in costs.items() if cost != law_study.full.time_us_per_period] == ["delay"]
 
 
 @pytest.mark.slow
@@ -93,31 +91,30 @@ def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(qualit
     change = by_name(study)["air_damping"].change
     # as above
     np.testing.assert_allclose(amplitudes(change), bare[:2], rtol=1e-5, atol=1e-7)
-    assert ("air_damping" in study.reduction.left_out) is not needed
+    assert ("air_damping" in study.not_needed) is not needed
 
 
 def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response():
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0, -100.0), None, force=ForceDrive(0.1, 90.0))
     study = study_effects(scene, accuracy=0.01)
     air, drive = (by_name(study)[name] for name in ("air_damping", "force_drive"))
-    assert (air.change.peak_amplitude, air.cost) == (None, None)
+    assert (air.change.peak_amplitude, air.time_us_per_period) == (None, None)
     assert "free frequency" in air.reason
     assert "only drive" in drive.reason
     # F Q/k
     expected = 0.1 * 40.0 / float(scene.cantilever.stiffness_n_per_m)
-    assert study.observed.reading is not None
-    np.testing.assert_allclose(study.observed.reading.peak_amplitude_nm, expected, rtol=1e-6)
-    assert study.reduction.left_out == ()
+    np.testing.assert_allclose(study.full.peak_amplitude_nm, expected, rtol=1e-6)
+    assert study.not_needed == []
 
 
 def test_all_effects_are_named():
-    platform = Platform(4.0, 181.8, 0.0, 1e-3, Tone(1.0, 47.0))
-    base, force = BaseDrive(0.1, 90.0, 0.0, Tone(0.0, 33.0)), ForceDrive(0.1, 90.0)
+    platform = Platform(4.0, 181.8)
+    base, force = BaseDrive(0.1, 90.0), ForceDrive(0.1, 90.0)
     scene = Scene(Cantilever(90.0, 40.0), platform, Contact.paper(structural_amplitude_n_per_m=0.0), base, force)
     effects = {effect.name: effect for effect in effects_in(scene)}
     assert set(effects) == {
-        *("capillary", "structural", "core", "viscous", "jkr", "air_damping", "ramp"),
-        *("second_frequency", "base_drive", "base_second_frequency", "force_drive"),
+        *("capillary", "structural", "core", "viscous", "jkr", "air_damping"),
+        *("base_drive", "force_drive"),
     }
     assert {name for name, effect in effects.items() if effect.required} == {"core", "jkr"}
     assert effects["base_drive"].without(scene).base is None
@@ -125,39 +122,21 @@ def test_all_effects_are_named():
     assert "capillary" not in effects["capillary"].without(scene).interaction.effects
 
 
-def test_a_scene_pays_only_for_its_effects():
-    """A left-out effect is absent from the program, which has fewer operations; a number of a law is in its formula.
-
-    Forces of a contact: `test_contact_effects_cost`.
-    """
-
-    def operations(scene: Scene) -> float:
-        begin = state(0.3, float(scene.platform.position(0.3)) + 10.0, 60.0)
-        program = jax.jit(lambda one: simulate(one, begin, 10.0, max_contacts=8)).lower(scene)
-        return (program.cost_analysis() or {})["flops"]
-
-    scene = law_scene()
-    whole = operations(scene)
-    known = {effect.name: effect for effect in effects_in(scene)}
-    assert operations(known["adhesion"].without(scene)) == whole
-    assert operations(known["delay"].without(scene)) < whole
-
-
 @pytest.mark.slow
 def test_a_force_of_no_strength_is_dropped_and_those_of_the_junction_required():
     scene = Scene(Cantilever(90.0, 40.0), DRIVE, Contact.paper(structural_amplitude_n_per_m=0.0))
     names = ["structural", "core", "jkr"]
     study = study_effects(scene, start_of(scene, (270.0, 5.0, 60.0)), accuracy=0.01, only=names)
-    reports, reduction = by_name(study), study.reduction
+    reports = by_name(study)
     # two programs for one motion: rounding, and the accuracy of 1e-9 to which the orbit is closed
     assert size_of(reports["structural"].change) < 1e-7
-    assert reduction.left_out == ("structural",)
-    assert reduction.scene.interaction.effects == ("capillary", "core", "viscous", "jkr")
-    for cost in (reports["structural"].cost, reduction.cost):
-        assert cost != study.cost
+    assert study.not_needed == ["structural"]
+    assert study.reduced.interaction.effects == ("capillary", "core", "viscous", "jkr")
+    for time in (reports["structural"].time_us_per_period, study.reduced_time_us_per_period):
+        assert time != study.full.time_us_per_period
     for name in ("core", "jkr"):
         assert reports[name].reason.startswith("required: ")
-        assert (reports[name].change.of_amplitude, reports[name].cost) == (None, None)
+        assert (reports[name].change.of_amplitude, reports[name].time_us_per_period) == (None, None)
 
 
 @pytest.mark.slow

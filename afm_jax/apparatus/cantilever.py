@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.checks import as_argument, as_optional_parameter, as_parameter, check_parameter, is_traced, readable
+from afm_jax.checks import as_argument, as_parameter, check_parameter, is_traced, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ, contradicting_mass, effective_mass_ng
 
 
@@ -72,7 +72,7 @@ class Cantilever(eqx.Module):
     """
 
     frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    quality_factor: Float[Array, "..."] | None = eqx.field(converter=as_optional_parameter, default=None)
+    quality_factor: Float[Array, "..."] | None = eqx.field(converter=as_parameter, default=None)
     mass_ng: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.0)
 
     __repr__ = readable

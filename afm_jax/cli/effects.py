@@ -1,15 +1,16 @@
 """`afm-jax effects SCENE.toml|PRESET`: what each effect of a scene changes and costs."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.command import Output
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Names, Positive, Share
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.saved import as_json
-from afm_jax.scenefile.scenefile import as_in_file, save_scene, scene_tables
+from afm_jax.scenefile.scenefile import as_in_file, save_scene
 from afm_jax.studies.effects import study_effects
 from afm_jax.whole_files import check_plain
 
@@ -26,9 +27,9 @@ def effects(
 
     Each effect is left out in turn, and the steady motion is compared with that of the full scene: peak and lock-in
     amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the scene's default
-    one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared. Costs are times
-    to compute a drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and
-    reduced.toml: the scene, and its start, without the effects that the accuracy does not need.
+    one; a motion that does not repeat (a ramp, several frequencies, chaos) is refused. Costs are times to compute a
+    drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and reduced.toml: the
+    scene, and its start, without the effects that the accuracy does not need.
 
     Args:
         session: for progress.
@@ -48,12 +49,10 @@ def effects(
             only=only,
             report=report,
         )
-    payload = as_json(study) | {"start": start._asdict()}
-    payload["reduced"]["scene"] = scene_tables(study.reduction.scene)
 
     def write_reduced(path: Path) -> None:
         check_plain(path)
-        save_scene(study.reduction.scene, path, start=start)
+        save_scene(study.reduced, path, start=start)
 
-    files = {"effects.png": picture_of("effects:effects_figure", study), "reduced.toml": write_reduced}
-    return Output.of(study, payload=payload, files=files, json_file="effects.json")
+    output = Output.of(study, "effects", payload=as_json(study) | {"start": start._asdict()})
+    return replace(output, files={**output.files, "reduced.toml": write_reduced})

@@ -21,7 +21,7 @@ import click
 from afm_jax.columns import csv_text
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words, write_whole
-from afm_jax.words import lines_at_most, shown
+from afm_jax.words import shown
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -171,8 +171,7 @@ class Session:
             click.echo(in_callers_words(strict_json(labelled(payload))))
             return
         width = _console(stderr=False).width
-        with lines_at_most(width):
-            lines = lines_of(*(part() if callable(part) else part for part in text))
+        lines = lines_of(*(part() if callable(part) else part for part in text), width=width)
         for line in (*lines, *(f"Note: {note}" for note in _notes())):
             click.echo(_broken(shown(in_callers_words(line)), width))
 

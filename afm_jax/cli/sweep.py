@@ -74,8 +74,8 @@ def sweep(
         alone = plan.recorder.alone and scheduler is None and find_spec("distributed") is not None
         workers = min(available_cores(), len(plan.regions())) if alone else 1
     with session.working("computing (the first chunk compiles)", "points") as report:
-        run = run_plan(plan, session.out, workers=workers, scheduler=scheduler, report=report)
-    store, points, chunks = session.out / STORE, math.prod(plan.shape), run.kept + run.computed
+        kept, computed = run_plan(plan, session.out, workers=workers, scheduler=scheduler, report=report)
+    store, points, chunks = session.out / STORE, math.prod(plan.shape), kept + computed
     messages, beyond = Counter[str](), None
     found = xarray.open_zarr(str(store))
     if MESSAGE in found:
@@ -85,7 +85,7 @@ def sweep(
         where = f"at {outside} of {points} points impacts come outside the speeds that the law is known for"
         beyond = f"Extrapolated: {where}." if outside else None
     grid = f"{' x '.join(map(str, plan.shape))} points in {counted(chunks, 'chunk')}"
-    lines = [f"{grid}. Computed in {run.seconds:.1f} s: {run.computed}; done before and kept: {run.kept}."]
+    lines = [f"{grid}. Computed: {computed}; done before and kept: {kept}."]
     if messages:
         lines.append(f"{messages.total()} points have no result to be trusted (`message` says why), most of them:")
         lines += [f"  {count}: {text}" for text, count in messages.most_common(_MOST_MESSAGES)]
@@ -94,9 +94,8 @@ def sweep(
         "points": points,
         "shape": plan.shape,
         "chunks": chunks,
-        "chunks_kept": run.kept,
-        "chunks_computed": run.computed,
-        "seconds": run.seconds,
+        "chunks_kept": kept,
+        "chunks_computed": computed,
         "without_result": messages.total(),
         "messages": dict(messages),
         "extrapolated": beyond,

@@ -14,9 +14,8 @@ def verification(
 ) -> Output:
     """Compare eqs. 5 to 8 with automatic differentiation, forward and reverse, at random scenes and starts.
 
-    Equations are compared as printed, and with air damping, viscous loss and a collision delay; eq. 8 on single-impact
-    orbits. Differences are relative to the sum of the magnitudes of a formula's terms. With --out verify.csv. Exit code
-    3 if one is too large.
+    Equations are compared as printed; eq. 8 on single-impact orbits. Differences are relative to the sum of the
+    magnitudes of a formula's terms. With --out verify.csv. Exit code 3 if one is too large.
 
     Args:
         session: for progress.

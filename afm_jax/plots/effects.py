@@ -23,16 +23,16 @@ def effects_figure(study: EffectStudy) -> Figure:
         sizes = np.abs(np.array([getattr(report.change, name) for report in reports], float))
         left.barh(rows + shift, np.maximum(sizes, _LEAST), height=0.3, color=colour, label=label)
     left.axvline(study.accuracy, color=ACCENT, lw=1.2, ls="--", label=f"wanted, {100.0 * study.accuracy:g} %")
-    left.set_yticks(rows, [report.effect.name.replace("_", " ") for report in reports])
+    left.set_yticks(rows, [report.name.replace("_", " ") for report in reports])
     left.set(xscale="log", xlim=(_LEAST, None), ylim=(len(reports) - 0.4, -0.6))
     for row, report in enumerate(reports):
         if report.change.peak_amplitude is None:
-            words = "no steady motion without it" if report.effect.required is None else "required"
+            words = "required" if report.required else "no steady motion without it"
             left.text(0.02, row, words, transform=left.get_yaxis_transform(), va="center", fontsize=10)
     label_axes(left, x="relative change (size)", y="")
-    right.barh(rows, [report.cost or 0.0 for report in reports], height=0.6, color=DARK)
-    if study.cost is not None:
-        right.axvline(study.cost, color=ACCENT, lw=1.2, ls=":", label="full scene")
+    right.barh(rows, [report.time_us_per_period or 0.0 for report in reports], height=0.6, color=DARK)
+    if study.full.time_us_per_period is not None:
+        right.axvline(study.full.time_us_per_period, color=ACCENT, lw=1.2, ls=":", label="full scene")
     label_axes(right, x="time without it (µs/drive period)", y="")
     figure.legend(loc="outside lower center", ncols=4, fontsize=10)
     figure.suptitle("Leaving out one effect", fontsize=12)

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import diffrax
@@ -29,6 +30,7 @@ from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
+from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
@@ -45,6 +47,8 @@ from afm_jax.motion.contact_motion import follow_contacts
 from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
+from afm_jax.report import Section, sections, table_of
+from afm_jax.results import Result, public_result
 from afm_jax.scenefile.scenefile import load_scene, read_scene
 from afm_jax.solve.derivatives import value_and_slopes
 from afm_jax.studies.timing import compiled_for, progress, seconds_a_call
@@ -109,15 +113,23 @@ class EquationOfMotion(eqx.Module):
         flies = phase == ContactPhase.DRY
         return jax.tree.map(lambda flying, touching: jnp.where(flies, flying, touching), flight, found)
 
-    def levels(self, phase: Any) -> tuple[Array, Array]:
-        """Return where a phase ends: x has fallen to the first, or risen to the second."""
-        never = jnp.asarray(jnp.inf)
-        if self.driven is None:
-            return jnp.zeros(()), never
-        driven = self.driven
-        inward = jnp.where(phase == ContactPhase.BRIDGE, driven.junction.forms_gap_nm, driven.forms_nm)
-        inward = jnp.where(phase == ContactPhase.JUNCTION, driven.solid.fold, inward)
-        return inward, jnp.where(phase == ContactPhase.BRIDGE, driven.breaks_nm, never)
+    def limits(self, phase: Any) -> tuple[Array, Array, Array, Array]:
+        """Return what a phase is bounded by.
+
+        It ends where x has fallen to the first number, or risen to the second; the third is the longest step in us that
+        sees every end of a flight, the fourth how long it lasts at most.
+        """
+        down, up, step = jnp.zeros(()), jnp.asarray(jnp.inf), jnp.asarray(jnp.inf)
+        flies = phase == ContactPhase.DRY
+        if self.driven is not None:
+            bridged = phase == ContactPhase.BRIDGE
+            down = jnp.where(bridged, self.driven.junction.forms_gap_nm, self.driven.forms_nm)
+            down = jnp.where(phase == ContactPhase.JUNCTION, self.driven.solid.fold, down)
+            up = jnp.where(bridged, self.driven.breaks_nm, up)
+        if self.cantilever is not None:
+            fastest = jnp.maximum(self.surface.fastest_angular_frequency, self.cantilever.angular_frequency)
+            step = jnp.where(flies, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, step)
+        return down, up, step, jnp.where(flies, _LONGEST_US, _LONGEST_TOUCH_US)
 
     def after(self, tip: Tip, risen: Bool[Array, ""]) -> Tip:
         """Return what follows the end of a phase; the rate of a tip that a law captures is NaN."""
@@ -126,7 +138,7 @@ class EquationOfMotion(eqx.Module):
             rebound = jnp.where(speeds.rebound > 0.0, speeds.rebound, jnp.nan)
             leaves = tip.time_us + speeds.delay
             return Tip(tip.phase, jnp.zeros_like(rebound), rebound, leaves, tip.time_us, tip.crossings + 2)
-        driven, (down, up) = self.driven, self.levels(tip.phase)
+        driven, (down, up, *_) = self.driven, self.limits(tip.phase)
         flew, pressed = tip.phase == ContactPhase.DRY, tip.phase == ContactPhase.JUNCTION
         presses = ~risen & (~pressed & ~flew if self.spans else flew)
         gap = jnp.where(pressed, driven.junction.breaks_gap_nm, jnp.where(risen, up, down))
@@ -168,8 +180,8 @@ class AccuracyProblem:
     reference: str
     finest: tuple[Any, Any]
     begin: Callable[[Parameters], tuple[EquationOfMotion, Tip]]
-    crossings: int
-    read: Callable[[Tip], Any]
+    crossings: int = 1
+    read: Callable[[Tip], Any] = attrgetter("arrived_us")
     events: int = 1
     relative: bool = False
     options: dict[str, Any] | None = None
@@ -187,7 +199,7 @@ class AccuracyProblem:
     def _with_slopes(self, setting: Any) -> tuple[Values, Slopes]:
         """Return values and slopes, by a program that compiles quickly: it is not timed."""
         value = partial(value_and_slopes, partial(self.solve, setting))
-        return jax.tree.map(np.asarray, compiled_for(value, self.at, options=quick_options(0))[0](self.at))
+        return jax.tree.map(np.asarray, compiled_for(value, self.at, options=quick_options(0))(self.at))
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
         """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""
@@ -198,18 +210,57 @@ class AccuracyProblem:
         return float(value), float(np.max(np.abs(np.asarray(slopes) - exact_slopes) / size))
 
 
-def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[str, Any]:
+@public_result(picture="afm_jax.plots.accuracy:accuracy_figure")
+@dataclass(frozen=True)
+class AccuracyStudy(Result):
+    """Errors and times of a problem.
+
+    Attributes:
+        problem: its name.
+        rows: each with of ("value" or "gradient"), method, setting, microseconds (of one impact or contact), error,
+            and reason where there is no error.
+        value_of: what the value is.
+        reference: what errors are taken against.
+        reference_error: its own error of the value.
+        reference_gradient_error: its own error of the gradient.
+    """
+
+    problem: str
+    rows: list[Row]
+    value_of: str
+    reference: str
+    reference_error: float
+    reference_gradient_error: float
+
+
+_COLUMNS = ("of", "method", "setting", "microseconds", "error")
+
+
+@sections.register
+def _(study: AccuracyStudy) -> list[Section]:
+    reference = (
+        f"Reference: {study.reference}, itself known to {study.reference_error:.0e} (gradient: "
+        f"{study.reference_gradient_error:.0e}). Times are those of one impact or contact on one core, programs "
+        "compiled. A gradient is that by all parameters of the problem, relative to its largest value among the tips."
+    )
+    table = table_of({name: name for name in _COLUMNS}, study.rows, form=".3g")
+    faults = [f"{row['method']}, {row['setting']}: {row['reason']}" for row in study.rows if "reason" in row]
+    title = f"Error of the {study.value_of} and of its gradient against time"
+    return [Section(title, [table, *dict.fromkeys(faults), reference])]
+
+
+@csv_columns.register
+def _(study: AccuracyStudy) -> CsvColumns:
+    return {"accuracy.csv": columns_of(study.rows, (*_COLUMNS, "reason"))}
+
+
+def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> AccuracyStudy:
     """Measure errors and times of a problem.
 
     Args:
         problem: "map", "collide", or a scene's file or preset.
         contacts: of a scene: number of the contact whose arrival is compared.
         quick: few settings, each measured once: to see that it works.
-
-    Returns:
-        `rows` with of ("value" or "gradient"), method, setting, microseconds (of one impact or contact), error,
-        compile_s, and reason where there is no error; `value_of`, what the value is; `reference` and its own errors
-        `reference_error`, `reference_gradient_error`.
 
     Raises:
         ValueError: if a scene's tip has fewer contacts.
@@ -225,16 +276,16 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
         *_compiled_rows(solved, "Diffrax Dopri8", partial(by_diffrax, solved), tolerances, repetitions),
         *_scipy_rows(solved, tolerances),
     ]
-    value, gradient = solved.doubt
-    told = {"reference": solved.reference, "reference_error": value, "reference_gradient_error": gradient}
-    return {"rows": sorted(rows, key=lambda row: row["of"] == "gradient"), "value_of": solved.what, **told}
+    rows.sort(key=lambda row: row["of"] == "gradient")
+    return AccuracyStudy(problem, rows, solved.what, solved.reference, *solved.doubt)
 
 
-def _row(of: str, method: str, setting: str, seconds: float, error: float, **more: Any) -> Row:
-    known = math.isfinite(error)
-    row = {"of": of, "method": method, "setting": setting, "microseconds": 1e6 * seconds if known else None}
-    reason = {} if known else {"reason": "the tip is captured, or the integrator gave up"}
-    return row | {"error": error if known else None} | reason | more
+def _row(of: str, method: str, setting: str, seconds: float, error: float) -> Row:
+    row = {"of": of, "method": method, "setting": setting, "microseconds": 1e6 * seconds, "error": error}
+    if math.isfinite(error):
+        return row
+    none = {"microseconds": None, "error": None, "reason": "the tip is captured, or the integrator gave up"}
+    return row | none
 
 
 def _compiled_rows(
@@ -254,18 +305,10 @@ def _compiled_rows(
             value = solve if number else partial(solve, setting)
             both = value, jax.jacfwd(value, argnums=len(arguments) - 1)
             programs = [compiled_for(each, *arguments, options=problem.options) for each in both]
-        errors = problem.errors(*(run(*arguments) for run, _ in programs))
-        for of, (run, compile_s), error in zip(("value", "gradient"), programs, errors, strict=True):
+        errors = problem.errors(*(run(*arguments) for run in programs))
+        for of, run, error in zip(("value", "gradient"), programs, errors, strict=True):
             seconds = min(seconds_a_call(run, *arguments, repetitions=repetitions))
-            yield _row(of, method, name, seconds / events, error, compile_s=compile_s)
-
-
-def _longest_step(motion: EquationOfMotion, phase: Any) -> Array:
-    """Return the longest step in us that sees every end of a flight; infinite in contact."""
-    if motion.cantilever is None:
-        return jnp.asarray(jnp.inf)
-    fastest = jnp.maximum(motion.surface.fastest_angular_frequency, motion.cantilever.angular_frequency)
-    return jnp.where(phase == ContactPhase.DRY, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, jnp.inf)
+            yield _row(of, method, name, seconds / events, error)
 
 
 def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters: Parameters) -> Values:
@@ -273,7 +316,7 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
     motion, tips = problem.begin(parameters)
 
     def phase_of(tip: Tip) -> Tip:
-        down, up = motion.levels(tip.phase)
+        down, up, step, longest = motion.limits(tip.phase)
         # called by position or by these names
         falls: Any = lambda t, y, args, **_: y[0] - down  # noqa: ARG005, E731
         rises: Any = lambda t, y, args, **_: y[0] - up  # noqa: ARG005, E731
@@ -281,12 +324,10 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
             diffrax.ODETerm(lambda _, y, __: motion.rates(tip.phase, *y)),
             diffrax.Dopri8(),
             0.0,
-            jnp.where(tip.phase == ContactPhase.DRY, _LONGEST_US, _LONGEST_TOUCH_US),
+            longest,
             None,
             (tip.x, tip.rate, tip.time_us),
-            stepsize_controller=diffrax.PIDController(
-                rtol=tolerance, atol=1e-3 * tolerance, dtmax=_longest_step(motion, tip.phase)
-            ),
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=1e-3 * tolerance, dtmax=step),
             # downwards alone: a tip leaves a surface with a gap of 0
             event=diffrax.Event([falls, rises], optimistix.Newton(1e-14, 1e-14), direction=[False, True]),
             adjoint=diffrax.ForwardMode(),
@@ -330,14 +371,9 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
         progress(f"accuracy: SciPy DOP853, {name}")
         step = tolerance ** (1.0 / 3.0)
         places = np.concatenate([at[None], at + step * np.eye(at.size), at - step * np.eye(at.size)])
-        try:
-            # once for the programs
-            value(tips[0], at, tolerance)
-            found = np.array([[value(tip, place, tolerance) for place in places] for tip in tips])
-        except ValueError as failure:
-            for of in ("value", "gradient"):
-                yield _row(of, "SciPy DOP853", name, math.nan, math.nan, reason=str(failure))
-            continue
+        # once for the programs
+        value(tips[0], at, tolerance)
+        found = np.array([[value(tip, place, tolerance) for place in places] for tip in tips])
         values, seconds = np.moveaxis(found, -1, 0)
         slopes = (values[:, 1 : 1 + at.size] - values[:, 1 + at.size :]) / (2.0 * step)
         spent = np.mean(seconds[:, 0]), np.mean(np.sum(seconds[:, 1:], axis=1))
@@ -358,12 +394,9 @@ class ScipyPrograms:
             return eqx.combine(unravel(vector), rest)
 
         self.after = jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen))
-        self.levels = jax.jit(lambda vector, phase: of(vector).levels(phase))
+        self.limits = jax.jit(lambda vector, phase: of(vector).limits(phase))
+        self.touching = jax.jit(lambda vector, phase, y: jnp.stack(of(vector).rates(phase, *y)), static_argnums=1)
         self.flight = jax.jit(lambda vector: _flight_numbers(of(vector)))
-        self.rates = {
-            phase: jax.jit(lambda vector, y, phase=phase: jnp.stack(of(vector).rates(phase, *y)))
-            for phase in (ContactPhase.BRIDGE, ContactPhase.JUNCTION)
-        }
 
     @staticmethod
     def vector(motion: EquationOfMotion) -> Array:
@@ -372,11 +405,29 @@ class ScipyPrograms:
 
 
 def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
-    """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
+    """Return Omega^2, Omega/Q, offset and ramp of the surface, and its cosines as rows."""
     cantilever, surface = motion.cantilever, motion.surface
     waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
-    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, ContactPhase.DRY)
+    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate
     return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
+
+
+def _rates_of_flight(square: Array, friction: Array, offset: Array, ramp: Array, waves: Array) -> Callable[..., Any]:
+    """Return `EquationOfMotion.rates` of a flight in plain numbers, without JAX, whose calls take longer than these."""
+    (stiff, loss, mean, drift), rows = map(float, (square, friction, offset, ramp)), np.asarray(waves).tolist()
+
+    def rates(_: float, y: Any) -> tuple[float, float, float]:
+        gap, rate, now = y.tolist()
+        height, speed, pull = gap + mean + drift * now, rate + drift, 0.0
+        for along, across, omega in rows:
+            cosine, sine = math.cos(omega * now), math.sin(omega * now)
+            moved = along * cosine + across * sine
+            height += moved
+            speed += omega * (across * cosine - along * sine)
+            pull += omega**2 * moved
+        return rate, pull - stiff * height - loss * speed, 1.0
+
+    return rates
 
 
 def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, tolerance: float) -> Tip:
@@ -389,98 +440,56 @@ def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, t
         crossings: how often it arrives at the sample or leaves it.
         tolerance: relative; the absolute one is a thousandth of it.
 
-    Raises:
-        ValueError: if a phase has no end, or a law captures the tip.
+    Returns:
+        The tip there; its rate and its arrival are NaN if a phase has no end, or the sample holds the tip.
     """
     for _ in range(_MOST_PHASES * crossings):
         if tip.crossings >= crossings:
             return tip
-        down, up = (float(level) for level in programs.levels(vector, tip.phase))
-        through = _flown_by_scipy if int(tip.phase) == ContactPhase.DRY else _touched_by_scipy
-        risen, ended = through(programs, vector, tip, (down, up), tolerance)
-        tip = jax.tree.map(np.asarray, programs.after(vector, ended, risen))
+        phase = ContactPhase(int(tip.phase))
+        down, up, step, longest = (float(limit) for limit in programs.limits(vector, phase))
+        events: list[Any] = [lambda _, y, down=down: y[0] - down, lambda _, y, up=up: y[0] - up]
+        for event, direction in zip(events, (-1.0, 1.0), strict=True):
+            vars(event).update(terminal=True, direction=direction)
+        rates: Any = lambda _, y, phase=phase: np.asarray(programs.touching(vector, phase, y))  # noqa: E731
+        if phase == ContactPhase.DRY:
+            rates = _rates_of_flight(*programs.flight(vector))
+        # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
+        with np.errstate(all="ignore"):
+            path = solve_ivp(
+                rates,
+                (0.0, longest),
+                [float(tip.x), float(tip.rate), float(tip.time_us)],
+                method="DOP853",
+                rtol=tolerance,
+                atol=1e-3 * tolerance,
+                max_step=step,
+                events=events,
+            )
+        if path.status != 1:
+            break
+        x, rate, now = map(np.asarray, path.y[:, -1])
+        ended = tip._replace(x=x, rate=rate, time_us=now)
+        tip = jax.tree.map(np.asarray, programs.after(vector, ended, len(path.t_events[1]) > 0))
         if not np.isfinite(tip.rate):
-            raise ValueError(f"the sample captures the tip that arrives at {float(tip.arrived_us):.6g} us")
-    raise ValueError(f"the sample holds the tip that arrives at {float(tip.arrived_us):.6g} us")
+            break
+    return tip._replace(rate=np.nan, arrived_us=np.nan)
 
 
-def _touched_by_scipy(
-    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
-) -> tuple[np.ndarray, Tip]:
-    """Return whether a phase of a contact ends at the gap that the tip rises to, and the tip there."""
-    rates, (down, up) = programs.rates[ContactPhase(int(tip.phase))], levels
-    ends: list[Any] = [lambda _, y: y[0] - down]
-    ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
-    state = [float(tip.x), float(tip.rate), float(tip.time_us)]
-    met, _, (_, rate, now) = _to_event(lambda _, y: np.asarray(rates(vector, y)), state, ends, tolerance)
-    return np.asarray(met == 1), tip._replace(rate=np.asarray(rate), time_us=np.asarray(now))
-
-
-def _flown_by_scipy(
-    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
-) -> tuple[np.ndarray, Tip]:
-    """Return False, for a flight ends at the lower gap, and the tip there: integrated in the lab, in plain numbers."""
-    *numbers, rows = programs.flight(vector)
-    square, friction, longest, offset, ramp = (float(number) for number in numbers)
-    waves, start = np.asarray(rows).tolist(), float(tip.time_us)
-
-    def height(now: float) -> float:
-        moved = sum(c * math.cos(omega * now) + s * math.sin(omega * now) for c, s, omega in waves)
-        return offset + ramp * now + moved
-
-    def speed(now: float) -> float:
-        return ramp + sum(o * (s * math.cos(o * now) - c * math.sin(o * now)) for c, s, o in waves)
-
-    def gap(flown: float, y: Any) -> float:
-        return y[0] - height(start + flown) - levels[0]
-
-    def rates(_: float, y: Any) -> tuple[float, float]:
-        return y[1], -square * y[0] - friction * y[1]
-
-    state = [float(tip.x) + height(start), float(tip.rate) + speed(start)]
-    _, flown, (_, velocity) = _to_event(rates, state, [gap], tolerance, (_LONGEST_US, longest))
-    rate = velocity - speed(start + flown)
-    return np.zeros((), bool), tip._replace(rate=np.asarray(rate), time_us=np.asarray(start + flown))
-
-
-def _to_event(
-    rates: Callable[[float, Any], Any],
-    state: list[float],
-    events: list[Any],
-    tolerance: float,
-    longest: tuple[float, float] = (_LONGEST_TOUCH_US, np.inf),
-) -> tuple[int, float, np.ndarray]:
-    """Return which event ends a phase, when, and the state there; `longest` are the phase's length and its steps'.
-
-    The first of the events is a fall through 0, the second a rise.
-
-    Raises:
-        ValueError: if none does.
-    """
-    for event, direction in zip(events, (-1.0, 1.0), strict=False):
-        vars(event).update(terminal=True, direction=direction)
-    # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
-    with np.errstate(all="ignore"):
-        path = solve_ivp(
-            rates,
-            (0.0, longest[0]),
-            state,
-            method="DOP853",
-            rtol=tolerance,
-            atol=1e-3 * tolerance,
-            max_step=longest[1],
-            events=events,
-        )
-    if path.status != 1:
-        raise ValueError(f"SciPy ended without an event: {path.message}")
-    met = next(place for place, times in enumerate(path.t_events) if len(times))
-    return met, float(path.t_events[met][0]), path.y_events[met][0]
-
-
-_ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
-"""Of the search for an impact, the last one its default."""
-_FINEST_US = 1e-15, 1e-14
-"""References of impacts with a law: the better one first."""
+_COARSEST_US = 1e-1
+"""The loosest root tolerance of the search for an impact; the tightest is its default."""
+_BY_ROOTS: dict[str, Any] = {
+    "settings": {f"root tolerance {each:g} us": each for each in (_COARSEST_US, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)},
+    "reference": "root tolerance 1e-15 us",
+    "finest": (1e-15, 1e-14),
+}
+"""Settings and reference of impacts with a law."""
+_IN_TIME: dict[str, Any] = {
+    "settings": {f"accuracy {level:g}": setting for level, setting in DRIVEN_SETTINGS.items()},
+    "reference": "every contact in time, in fine steps",
+    "finest": (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300)),
+}
+"""Those of contacts in time."""
 
 
 def impact_times(tips: int) -> AccuracyProblem:
@@ -508,12 +517,8 @@ def impact_times(tips: int) -> AccuracyProblem:
         what="time of the next impact (us)",
         at=jnp.zeros(2),
         solve=solve,
-        settings={f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US},
-        reference="root tolerance 1e-15 us",
-        finest=_FINEST_US,
         begin=begin,
-        crossings=1,
-        read=lambda tip: tip.arrived_us,
+        **_BY_ROOTS,
     )
 
 
@@ -561,13 +566,8 @@ def rebound_speeds(tips: int) -> AccuracyProblem:
         reference="a quadrature converged to rounding",
         finest=_QUADRATURES,
         begin=begin,
-        crossings=1,
-        read=lambda tip: tip.rate,
+        read=attrgetter("rate"),
     )
-
-
-IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
-"""References of contacts in time, in fine steps: the better one first."""
 
 
 def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
@@ -583,17 +583,13 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     surface = world[0]
     if isinstance(scene.interaction, Law):
         motion = EquationOfMotion(scene.cantilever, surface, scene.interaction)
-        settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
-        # the coarsest of them may be as late
-        finest = _FINEST_US
-        reference = "root tolerance 1e-15 us"
-        beyond_us = 2.0 * _ROOT_TOLERANCES_US[0]
+        # the coarsest setting may be as late
+        compared, beyond_us = _BY_ROOTS, 2.0 * _COARSEST_US
     else:
         driven = driven_by(scene.interaction, scene.cantilever, surface)
         motion = EquationOfMotion(scene.cantilever, surface, None, driven, scene.interaction.spans)
-        settings = {f"accuracy {level:g}": setting for level, setting in DRIVEN_SETTINGS.items()}
-        finest, reference, beyond_us = IN_TIME, "every contact in time, in fine steps", 1e-3
-    left = times_of_contact(scene, contacts, start.time_us + _LONGEST_US * contacts, finest[0], start)[1]
+        compared, beyond_us = _IN_TIME, 1e-3
+    left = times_of_contact(scene, contacts, start.time_us + _LONGEST_US * contacts, compared["finest"][0], start)[1]
     # no longer than until the last of them has left
     until = jnp.where(jnp.isfinite(left), left + beyond_us, start.time_us)
 
@@ -613,14 +609,11 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
         what=f"arrival of contact {contacts} (us)",
         at=jnp.zeros(1),
         solve=solve,
-        settings=settings,
-        reference=reference,
-        finest=finest,
         begin=begin,
         crossings=2 * contacts - 1,
-        read=lambda tip: tip.arrived_us,
         events=contacts,
         options=quick_options(),
+        **compared,
     )
     if not np.isfinite(problem.exact[0]).all():
         raise ValueError(

@@ -1,9 +1,8 @@
 """What each effect of a scene changes and costs, and which effects a wanted accuracy does not need.
 
 An effect is left out: it is absent from the compiled program, not multiplied by zero. The scene without it is followed
-from the same start, and its steady orbit (where nothing repeats, the last fifth of the duration) is read as that of the
-full scene is. What the two readings differ by is what the effect changes; what the programs' times differ by is what
-it costs.
+from the same start, and its steady orbit is read as that of the full scene is. What the two readings differ by is what
+the effect changes; what the programs' times differ by is what it costs.
 """
 
 import statistics
@@ -24,17 +23,16 @@ from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import WHY_REQUIRED
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import MotionWindow
-from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
-from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.settle import last_fifth
+from afm_jax.motion.periodic import Orbit, follow_to_orbit
+from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.report import Cell, Section, sections, table_of
 from afm_jax.results import Result, public_result
 from afm_jax.saved import as_json
+from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.studies.timing import seconds_a_call
 from afm_jax.words import counted, known
 
@@ -72,17 +70,12 @@ def effects_in(scene: Scene) -> list[SceneEffect]:
     effects = _of_interaction(scene.interaction)
     if scene.cantilever.quality_factor is not None:
         effects.append(_putting("air_damping", "cantilever.quality_factor"))
-    if scene.platform.offset_rate_nm_per_us != 0.0:
-        effects.append(_putting("ramp", "platform.offset_rate_nm_per_us", 0.0))
     driven = {name: getattr(scene, name) for name in _AMPLITUDES if getattr(scene, name) is not None}
     moving = [name for name, drive in driven.items() if getattr(drive, _AMPLITUDES[name]) != 0.0]
-    for name, drive in driven.items():
-        own = "" if name == "platform" else f"{name}_"
-        if drive.second is not None:
-            effects.append(_putting(f"{own}second_frequency", f"{name}.second"))
-        if own:
+    for name in driven:
+        if name != "platform":
             only = "it is the scene's only drive" if moving == [name] else None
-            effects.append(_putting(f"{own}drive", name)._replace(required=only))
+            effects.append(_putting(f"{name}_drive", name)._replace(required=only))
     return effects
 
 
@@ -122,7 +115,8 @@ def _plain_delay(scene: Scene) -> Any:
 # --- what is compared -------------------------------------------------------------------------------------------------
 
 
-class Change(NamedTuple):
+@dataclass(frozen=True)
+class Change:
     """What changes, relative to the full scene; the phase in degrees; None: not a number."""
 
     peak_amplitude: float | None = None
@@ -138,8 +132,9 @@ class Change(NamedTuple):
         return max(abs(self.peak_amplitude), abs(self.lockin_amplitude))
 
 
-class Reading(NamedTuple):
-    """What a motion shows in a window of time, in a few numbers."""
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a steady orbit shows, in a few numbers."""
 
     peak_amplitude_nm: float
     """Largest height above the rest position."""
@@ -152,36 +147,34 @@ class Reading(NamedTuple):
     energy_per_impact_aj: float | None
     """None without impacts."""
     impacts: int
+    drive_periods: int
+    time_us_per_period: float | None = None
+    """What computing a drive period takes: the median of several runs."""
 
 
 class Observed(NamedTuple):
-    """What a scene shows; without a reading the reason says why."""
+    """A scene, its steady orbit and what that shows; without an orbit the reason says why."""
 
     scene: Scene
+    orbit: Orbit | None
+    reason: str | None
     reading: Reading | None
-    reason: str | None = None
-    orbit: Orbit | None = None
 
 
-class EffectReport(NamedTuple):
+@dataclass(frozen=True)
+class EffectReport:
     """One effect: what leaving it out changes and costs."""
 
-    effect: SceneEffect
+    name: str
+    required: bool
+    """Whether the scene cannot do without it."""
     change: Change
     reason: str | None
     """Why there is no change to tell: the effect is required, or nothing steady is left without it."""
-    cost: float | None
-    """Of the scene without it (see `EffectStudy`); None without a motion to time."""
-
-
-class Reduction(NamedTuple):
-    """What the wanted accuracy of the amplitude does not need."""
-
-    left_out: tuple[str, ...]
-    change: Change
-    """Of all of them together, simulated."""
-    scene: Scene
-    cost: float | None
+    time_us_per_period: float | None
+    """Of the scene without it; None without a motion to time."""
+    needed: bool = True
+    """For the wanted accuracy."""
 
 
 @public_result(picture="afm_jax.plots.effects:effects_figure")
@@ -190,89 +183,67 @@ class EffectStudy(Result):
     """All effects of a scene, and which of them an accuracy of the amplitudes does not need.
 
     Attributes:
-        observed: the full scene.
-        cost: what computing a drive period takes, in us: the median of several runs.
+        full: what the full scene shows.
         effects: each left out.
         accuracy: that is wanted, relative.
-        reduction: what it does not need.
+        not_needed: the effects that it does not need.
+        joint_change: what leaving all of them out changes, simulated.
+        reduced: the scene without them.
+        reduced_time_us_per_period: what computing a drive period of it takes.
     """
 
-    observed: Observed
-    cost: float | None
+    full: Reading
     effects: list[EffectReport]
     accuracy: float
-    reduction: Reduction
+    not_needed: list[str]
+    joint_change: Change
+    reduced: Scene
+    reduced_time_us_per_period: float | None
 
 
 @as_json.register
 def _(study: EffectStudy) -> dict[str, Any]:
-    reading, orbit, reduction = study.observed.reading, study.observed.orbit, study.reduction
-    assert reading is not None  # a study has one  # noqa: S101
-    return {
-        "compared": "last fifth of the duration" if orbit is None else "steady orbits",
-        "full": {
-            **reading._asdict(),
-            "drive_periods": None if orbit is None else orbit.periods,
-            "time_us_per_period": study.cost,
-        },
-        "effects": [
-            {
-                "name": report.effect.name,
-                "required": report.effect.required is not None,
-                "change": report.change._asdict(),
-                "reason": report.reason,
-                "time_us_per_period": report.cost,
-                "needed": report.effect.name not in reduction.left_out,
-            }
-            for report in study.effects
-        ],
-        "accuracy": study.accuracy,
-        "not_needed": list(reduction.left_out),
-        "joint_change": reduction.change._asdict(),
-        "reduced": {"time_us_per_period": reduction.cost},
-    }
+    told = {"compared": "steady orbits"} | vars(study)
+    time = told.pop("reduced_time_us_per_period")
+    return told | {"reduced": {"time_us_per_period": time, "scene": scene_tables(study.reduced)}}
 
 
 @sections.register
 def _(study: EffectStudy) -> list[Section]:
-    payload, reduction = as_json(study), study.reduction
-    full, joint = payload["full"], payload["joint_change"]
+    full, joint = study.full, study.joint_change
     cells: dict[str, Cell] = {
         "effect": "name",
-        "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
-        "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
-        "phase\ndeg": lambda effect: effect["change"]["lockin_phase_deg"],
-        "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
+        "peak\nchange": lambda effect: _percent(effect.change.peak_amplitude),
+        "lock-in\nchange": lambda effect: _percent(effect.change.lockin_amplitude),
+        "phase\ndeg": lambda effect: effect.change.lockin_phase_deg,
+        "loss/impact\nchange": lambda effect: _percent(effect.change.energy_per_impact),
         "time\nus/period": "time_us_per_period:.4g",
-        "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
+        "": lambda effect: "required" if effect.required else "" if effect.needed else "not needed",
     }
-    periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
     summary = (
-        f"Full scene: {counted(full['impacts'], 'impact')} in "
-        f"{window if periods is None else counted(periods, 'drive period')}; "
-        f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
-        f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
-        f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(study.cost, '.4g')} us to compute "
-        "a drive period."
+        f"Full scene: {counted(full.impacts, 'impact')} in {counted(full.drive_periods, 'drive period')}; "
+        f"peak {full.peak_amplitude_nm:.5g} nm, lock-in at {full.lockin_frequency_khz:.6g} kHz "
+        f"{full.lockin_amplitude_nm:.5g} nm at {full.lockin_phase_deg:.4g} deg, "
+        f"{known(full.energy_per_impact_aj, '.4g')} aJ lost per impact; {known(full.time_us_per_period, '.4g')} us to "
+        "compute a drive period."
     )
-    reasons = [f"{report.effect.name}: {report.reason}." for report in study.effects if report.reason is not None]
+    reasons = [f"{effect.name}: {effect.reason}." for effect in study.effects if effect.reason is not None]
     conclusion = "every effect that can be left out is needed."
-    if reduction.left_out:
+    if study.not_needed:
         conclusion = (
-            f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
-            f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
-            f"{known(reduction.cost, '.4g')} us per drive period."
+            f"these are not needed: {', '.join(study.not_needed)}. Without all of them the peak changes by "
+            f"{_percent(joint.peak_amplitude)}, the lock-in amplitude by {_percent(joint.lockin_amplitude)}; "
+            f"{known(study.reduced_time_us_per_period, '.4g')} us per drive period."
         )
-    table = table_of(cells, payload["effects"], form=".3g")
+    table = table_of(cells, study.effects, form=".3g")
     end = f"For amplitudes to {100.0 * study.accuracy:g} % {conclusion}"
     return [Section("", [summary, "Without the effect:", table, *reasons, end])]
 
 
 @csv_columns.register
 def _(study: EffectStudy) -> CsvColumns:
-    rows = as_json(study)["effects"]
-    changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
-    return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
+    rows = [vars(effect) | {f"change_{name}": x for name, x in vars(effect.change).items()} for effect in study.effects]
+    return {"effects.csv": columns_of(rows, [name for name in rows[0] if name != "change"] if rows else ())}
 
 
 def _percent(share: float | None) -> str:
@@ -303,14 +274,9 @@ def study_effects(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
-        ValueError: if the scene itself has no motion to compare with, an effect of `only` is not in the scene, or the
-            accuracy or the duration is not positive.
+        ValueError: if the scene itself has no motion to compare with, or an effect of `only` is not in the scene.
     """
     require_float64(scene)
-    if not 0.0 < accuracy < 1.0:
-        raise ValueError(f"`accuracy` must be between 0 and 1, but is {accuracy!r}")
-    if duration_us is not None and not duration_us > 0.0:
-        raise ValueError(f"`duration_us` must be positive, but is {duration_us!r}")
     effects = {effect.name: effect for effect in effects_in(scene)}
     for name in only or ():
         if name not in effects:
@@ -318,36 +284,39 @@ def study_effects(
     chosen = [effect for name, effect in effects.items() if only is None or name in only]
     view = _View(scene, start, duration_us)
     full = view.observed(scene)
-    if view.settles and full.reading is None and (full.reason or "").startswith("nothing repeats"):
-        view.settles = False
-        full = view.observed(scene)
     if full.reading is None:
-        raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
-    reports = []
+        raise ValueError(f"the scene has no steady orbit to compare with: {full.reason}; give it another start")
+    reports: dict[str, EffectReport] = {}
     for number, effect in enumerate(chosen, 1):
         report(number, len(chosen) + 2)
-        if effect.required is not None:
-            reports.append(EffectReport(effect, Change(), f"required: {effect.required}", None))
-            continue
-        without = view.observed(effect.without(scene))
-        reports.append(EffectReport(effect, *view.change(full, without), view.cost(without)))
+        told: tuple[Any, ...] = Change(), f"required: {effect.required}", None
+        if effect.required is None:
+            without = view.observed(effect.without(scene))
+            told = *view.change(full, without), view.cost(without)
+        reports[effect.name] = EffectReport(effect.name, effect.required is not None, *told)
     report(len(chosen) + 1, len(chosen) + 2)
-    reduction = _reduced(view, full, reports, accuracy)
-    return EffectStudy(full, view.cost(full), reports, accuracy, reduction)
+    sizes = [(each.change.of_amplitude, effects[name]) for name, each in reports.items()]
+    small = [(size, effect) for size, effect in sizes if size is not None and size < accuracy]
+    not_needed, joint_change, reduced = _reduced(view, full, small, accuracy)
+    for name in not_needed:
+        reports[name] = replace(reports[name], needed=False)
+    reading = replace(full.reading, time_us_per_period=view.cost(full))
+    cost = view.cost(reduced)
+    return EffectStudy(reading, [*reports.values()], accuracy, not_needed, joint_change, reduced.scene, cost)
 
 
-def _reduced(view: "_View", full: Observed, reports: list[EffectReport], accuracy: float) -> Reduction:
+def _reduced(
+    view: "_View", full: Observed, sizes: Sequence[tuple[float, SceneEffect]], accuracy: float
+) -> tuple[list[str], Change, Observed]:
     """Leave out effects from the smallest on, as long as all together change the amplitudes by less."""
-    sizes = [(report.change.of_amplitude, report.effect) for report in reports]
-    candidates = sorted(((size, effect) for size, effect in sizes if size is not None), key=lambda each: each[0])
     reduced, left_out, change = full, [], Change(0.0, 0.0, 0.0, 0.0)
-    for size, effect in candidates:
-        smaller = view.observed(effect.without(reduced.scene)) if size < accuracy else full._replace(reading=None)
+    for _, effect in sorted(sizes, key=lambda each: each[0]):
+        smaller = view.observed(effect.without(reduced.scene))
         joint, _ = view.change(full, smaller)
         if joint.of_amplitude is not None and joint.of_amplitude < accuracy:
             reduced, change = smaller, joint
             left_out.append(effect.name)
-    return Reduction(tuple(left_out), change, reduced.scene, view.cost(reduced))
+    return left_out, change, reduced
 
 
 class _View:
@@ -356,7 +325,6 @@ class _View:
     def __init__(self, scene: Scene, start: State | None, duration_us: float | None) -> None:
         """Take what the full scene says."""
         self.drive: DrivePeriod = drive_of(scene)
-        self.settles = self.drive.aperiodic is None
         self.start = default_start(scene) if start is None else start
         self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
         # compiled once for every choice of effects; numbers change without compiling again
@@ -364,35 +332,20 @@ class _View:
         self._costs: dict[Any, float] = {}
 
     def observed(self, scene: Scene) -> Observed:
-        """Return what a scene shows: its steady orbit, or the end of the duration if the full scene has none."""
-        reason = drive_of(scene).aperiodic if self.settles else why_impossible(scene)
-        if reason is not None:
-            return Observed(scene, None, reason)
-        if self.settles:
-            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, partial(self._run, scene))
-            if orbit is None:
-                return Observed(scene, None, reason)
-            begin = float(orbit.start.time_us)
-            found = Observed(scene, None, None, orbit)
-            window, motion = (begin, begin + orbit.period_us), orbit.motion
-        else:
-            run = follow_long(scene, self.start, self.duration_us)
-            motion, found = run.simulation, Observed(scene, None)
-            outcome = MotionOutcome(int(motion.outcome))
-            if run.verdict.stuck or outcome != MotionOutcome.FINISHED:
-                return found._replace(reason="the sample holds the tip" if run.verdict.stuck else outcome.sentence)
-            first = float(self.start.time_us)
-            fifth = last_fifth(first, first + self.duration_us, self.drive)
-            window = fifth.from_us, fifth.to_us
-        return found._replace(reading=_read(scene, motion, window, _periods_read(found)))
+        """Return what a scene shows."""
+        aperiodic, run = drive_of(scene).aperiodic, partial(self._run, scene)
+        orbit, reason = None, aperiodic
+        if aperiodic is None:
+            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, run)
+        return Observed(scene, orbit, reason, None if orbit is None else _read(scene, orbit))
 
     def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
         """Return what changed, and what there is to say."""
         before, after = full.reading, without.reading
-        if before is None or after is None:
+        if before is None or after is None or full.orbit is None or without.orbit is None:
             return Change(), None if without.reason is None else f"without it: {without.reason}"
         # which of the N equivalent periods is locked is unknown
-        turn = 360.0 / _periods_read(full)
+        turn = 360.0 / _periods_read(full.scene, full.orbit)
         phase = (after.lockin_phase_deg - before.lockin_phase_deg + 0.5 * turn) % turn - 0.5 * turn
         lost, lost_after = before.energy_per_impact_aj, after.energy_per_impact_aj
         change = Change(
@@ -401,21 +354,20 @@ class _View:
             phase,
             lost_after / lost - 1.0 if lost and lost_after is not None else None,
         )
-        kinds = [None if one.orbit is None else (one.orbit.impacts, one.orbit.periods) for one in (full, without)]
+        kinds = [(orbit.impacts, orbit.periods) for orbit in (full.orbit, without.orbit)]
         if kinds[0] == kinds[1]:
             return change, None
         reason = f"without it: another orbit, {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
-        return change._replace(lockin_phase_deg=None), reason
+        return replace(change, lockin_phase_deg=None), reason
 
     def cost(self, observed: Observed) -> float | None:
-        """Return what following a scene costs, its steady orbit if there is one; one program has one cost."""
-        if observed.reading is None:
+        """Return what following a scene's steady orbit costs; one program has one cost."""
+        if observed.orbit is None:
             return None
         structure = jax.tree.structure(observed.scene)
         if structure not in self._costs:
-            start = self.start if observed.orbit is None else observed.orbit.start
             duration = min(_PERIODS_TIMED * self.drive.period_us, self.duration_us)
-            arguments = _arguments(observed.scene, start, duration)
+            arguments = _arguments(observed.scene, observed.orbit.start, duration)
             seconds = statistics.median(seconds_a_call(self._follow, *arguments, repetitions=_REPETITIONS))
             self._costs[structure] = 1e6 * seconds * self.drive.period_us / duration
         return self._costs[structure]
@@ -429,19 +381,19 @@ def _arguments(scene: Scene, start: State, duration_us: float) -> tuple[Scene, S
     return scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float)
 
 
-def _periods_read(observed: Observed) -> int:
+def _periods_read(scene: Scene, orbit: Orbit) -> int:
     """Return how many drive periods a period of what the lock-in reads has.
 
-    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency, and
-    where no orbit is steady.
+    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency.
     """
-    scene, orbit = observed.scene, observed.orbit
-    return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
+    return orbit.periods if scene.base is None and scene.force is None else 1
 
 
-def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], periods: int) -> Reading:
-    """Return a reading of a simulation over a window, by a lock-in at the drive's frequency over some periods."""
-    motion = MotionWindow(DensePath(scene, simulation), *window, periods)
+def _read(scene: Scene, orbit: Orbit) -> Reading:
+    """Return a reading of an orbit, by a lock-in at the drive's frequency over some periods."""
+    begin = float(orbit.start.time_us)
+    dense = DensePath(scene, orbit.motion)
+    motion = MotionWindow(dense, begin, begin + orbit.period_us, _periods_read(scene, orbit))
     lost, line = motion.dense.contacts.energy_lost_aj[motion.begun], motion.height.at_response
     return Reading(
         peak_amplitude_nm=motion.height.largest,
@@ -450,4 +402,5 @@ def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], per
         lockin_phase_deg=line.phase_deg,
         energy_per_impact_aj=float(lost.mean()) if lost.size else None,
         impacts=int(lost.size),
+        drive_periods=orbit.periods,
     )

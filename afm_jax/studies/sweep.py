@@ -11,13 +11,13 @@ import json
 import math
 import os
 import tempfile
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -29,10 +29,9 @@ from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
-from afm_jax.contact.collide import ONLY_FREE, collide
+from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import DRIVEN_NUMBERS, ORBIT_NUMBERS, highest_orbits
-from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
@@ -43,6 +42,7 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
+from afm_jax.results import known_columns
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     batch_family,
@@ -232,20 +232,24 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
     if what == "collide":
         columns.pop(APPROACH_SPEED, None)
     check_ranges(scene, *(ParameterRange(path, values.min(), values.max()) for path, values in columns.items()))
-    builder, usual = _RECORDERS[what]
+    builder = _RECORDERS[what]
+    usual = {
+        each.name: each.default for each in signature(builder).parameters.values() if each.kind is each.KEYWORD_ONLY
+    }
+    settings = {name: value for name, value in usual.items() if name not in ("accuracy", "start")}
     for key in record:
-        if key not in usual:
-            raise ValueError(f"[record]: unknown key {key} of {what!r}; it has {', '.join(usual)}")
-    chosen = usual | {key: _setting(key, value, usual[key]) for key, value in record.items()}
+        if key not in settings:
+            raise ValueError(f"[record]: unknown key {key} of {what!r}; it has {', '.join(settings)}")
+    chosen = {key: _setting(key, value, settings[key]) for key, value in record.items()}
     accuracy = given.get("accuracy")
     if accuracy is not None:
         if not isinstance(scene.interaction, Contact):
             raise ValueError("`accuracy` is about resolved contacts, and this scene has none: leave `accuracy` out")
         if not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
             raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
-        chosen["accuracy"] = accuracy
+        chosen |= {"accuracy": accuracy} if "accuracy" in usual else {}
     if given.get("start"):
-        if what != "simulation":
+        if "start" not in usual:
             raise ValueError(f"a start is of use for simulations alone: leave it out for {what!r}")
         chosen["start"] = Start(**given["start"])
     return builder(scene, tuple(columns), **chosen)
@@ -267,27 +271,10 @@ def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
     return batch_family(scene, paths) if paths else lambda _: scene
 
 
-def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
-    """Return a function of columns of any length, block by block on all cores; blocks of one shape, so one program."""
-    # what a processor's cache holds, or what fills an accelerator
-    block = 1024 if jax.default_backend() == "cpu" else 1 << 16
-    return partial(in_blocks, jax.jit(record), block=block, widths=(block,))
-
-
-def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callable[[Columns], Columns]:
-    """Return a function of columns from one of a point, whose neighbours would tell in last digits."""
-
-    def work(columns: Columns) -> Columns:
-        rows = [record(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-        return {name: [row[name] for row in rows] for name in rows[0]}
-
-    return work
-
-
-def _orbits(
-    scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], accuracy: float = CHART_ACCURACY
-) -> Recorder:
+def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...] = (1,)) -> Recorder:
     """Record the stable single-impact orbits of scenes; of several of one order the highest."""
+    if isinstance(scene.interaction, Contact):
+        raise ValueError("'orbits' are those of laws: for a resolved contact record 'simulation', or make a chart")  # noqa: TRY004
     sample_driven(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
@@ -295,11 +282,6 @@ def _orbits(
         if "frequency" in path:
             # a little aside: says why not, where another part has the same frequency
             sample_driven(scene_batch(scene, {path: np.array([1.001 * parameter_values(scene)[path]])}))
-    extra = {"order": orders}
-    if isinstance(scene.interaction, Contact):
-        record = partial(_contact_orbits, scene, orders, accuracy)
-        return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
-
     made = _scenes(scene, paths)
 
     def record_batch(columns: Columns) -> Columns:
@@ -312,33 +294,10 @@ def _orbits(
 
     names = ORBIT_NUMBERS + (() if scene.base is None and scene.force is None else DRIVEN_NUMBERS)
     points = 4096 if impact_law_of(scene).delay else 1 << 18
-    return Recorder(_in_batches(record_batch), points, ("peak_amplitude_nm", "stable_orbits"), extra)
-
-
-def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row: dict[str, float]) -> dict[str, Any]:
-    """Return what is recorded of the single-impact orbits of one resolved contact."""
-    try:
-        one = scene_batch(scene, {name: np.array([value]) for name, value in row.items()})
-        found = single_contact_orbits(one, orders, accuracy=accuracy)
-    except ValueError as error:
-        nothing, no = np.full(len(orders), math.nan), np.zeros(len(orders), bool)
-        return dict.fromkeys(_CONTACT_NUMBERS, nothing) | dict.fromkeys(_CONTACT_TRUTHS, no) | {MESSAGE: f"{error}"}
-    return {name: found[name][:, 0] for name in _CONTACT_NUMBERS + _CONTACT_TRUTHS} | {MESSAGE: ""}
-
-
-_CONTACT_NUMBERS = ("peak_amplitude_nm", "largest_multiplier")
-_CONTACT_TRUTHS = ("stable", "admissible", "unresolved")
-"""Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
-_COLLISION_NUMBERS = (
-    "rebound_speed_nm_per_us",
-    "collision_delay_us",
-    "time_in_contact_us",
-    "time_in_junction_us",
-    "deepest_gap_nm",
-    "bridge_hysteresis_aj",
-    "junction_hysteresis_aj",
-    "viscous_loss_aj",
-)
+    # what a processor's cache holds, or what fills an accelerator; blocks of one shape have one program
+    block = 1024 if jax.default_backend() == "cpu" else 1 << 16
+    work = partial(in_blocks, jax.jit(record_batch), block=block, widths=(block,))
+    return Recorder(work, points, ("peak_amplitude_nm", "stable_orbits"), {"order": orders})
 
 
 def _codes(kinds: Any) -> dict[int, str]:
@@ -346,33 +305,37 @@ def _codes(kinds: Any) -> dict[int, str]:
 
 
 def _collisions(
-    scene: Scene, paths: tuple[str, ...], *, approach_speed_nm_per_us: float, accuracy: float = 1e-9
+    scene: Scene, paths: tuple[str, ...], *, approach_speed_nm_per_us: float = 30.0, accuracy: float = 1e-9
 ) -> Recorder:
     """Record collisions of free tips with the contacts of scenes."""
     if not isinstance(scene.interaction, Contact):
         raise ValueError("'collide' is about a resolved contact: the scene needs model = \"contact\"")  # noqa: TRY004
+    made = jax.jit(_scenes(scene, paths))
 
-    made = _scenes(scene, paths)
-
-    def record(columns: Columns) -> Columns:
+    def work(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
-        speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
+        speeds = np.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
         scenes = made(columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
-        trusted, numbers = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION, {}
-        for name in _COLLISION_NUMBERS:
-            # the rebound speed of a tip that is captured is 0
-            stays = found.captured & (name in ONLY_FREE and name != _COLLISION_NUMBERS[0])
-            numbers[name] = jnp.where(trusted & ~stays, getattr(found, name), jnp.nan)
-        return numbers | {"captured": found.captured, "outcome": found.outcome}
+        results = {name: column for name, (column, _) in known_columns(found).items() if name not in _NOT_KEPT}
+        # that of a tip that is captured is 0
+        return results | {shown[0]: np.where(found.captured, 0.0, results[shown[0]])}
 
     shown = ("rebound_speed_nm_per_us", "collision_delay_us")
-    words = {"outcome": _codes(CollisionOutcome)}
-    return Recorder(_in_batches(record), 16384, shown, words=words)
+    return Recorder(work, 16384, shown, words={"outcome": _codes(CollisionOutcome)})
+
+
+_NOT_KEPT = (APPROACH_SPEED, "end_energy_aj")
+"""Fields of a collision that no sweep records: an axis, and what the energies lost say."""
 
 
 def _lyapunov(
-    scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int, accuracy: float = DEFAULT_ACCURACY
+    scene: Scene,
+    paths: tuple[str, ...],
+    *,
+    impacts: int = 2000,
+    transient: int = 500,
+    accuracy: float = DEFAULT_ACCURACY,
 ) -> Recorder:
     """Record the exponents of motions that begin as in `bouncing_tips`."""
     sample_driven(scene)
@@ -401,7 +364,7 @@ _REFUSED = -1
 
 
 def _simulation(
-    scene: Scene, paths: tuple[str, ...], *, periods: float, accuracy: float = 1e-9, start: Start | None = None
+    scene: Scene, paths: tuple[str, ...], *, periods: float = 2000.0, accuracy: float = 1e-9, start: Start | None = None
 ) -> Recorder:
     """Record what an experiment reads of scenes in time, followed until they settle or for some drive periods."""
     family = scene_family(scene, *paths)
@@ -409,16 +372,12 @@ def _simulation(
     nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {"outcome": _REFUSED, MESSAGE: ""}
     nothing |= {EXTRAPOLATED: False} if isinstance(scene.interaction, TabulatedLaw) else {}
 
-    def record(row: dict[str, float]) -> dict[str, Any]:
-        one = family(*row.values())
-        try:
-            longest = periods * drive_of(one).period_us
-            run = follow_long(one, start_of(one, start), longest, until_settled=True, accuracy=accuracy)
-        except ValueError as error:
-            return nothing | {MESSAGE: str(error)}
+    def record(one: Scene) -> Columns:
+        longest = periods * drive_of(one).period_us
+        run = follow_long(one, start_of(one, start), longest, until_settled=True, accuracy=accuracy)
         found, verdict = run.simulation, run.verdict
         outcome = MotionOutcome(int(found.outcome))
-        results = nothing | {
+        results: Columns = {
             "settled": verdict.settled,
             "stuck": verdict.stuck,
             "order": verdict.periods or 0,
@@ -436,17 +395,28 @@ def _simulation(
         told = {} if seen.window.responses else {MESSAGE: TOO_SHORT}
         return results | {name: value for name, value in values.items() if value is not None} | told
 
+    def at(*values: float) -> Columns:
+        try:
+            return nothing | record(family(*values))
+        except ValueError as error:
+            return nothing | {MESSAGE: str(error)}
+
+    def work(columns: Columns) -> Columns:
+        # one by one: neighbours would tell in last digits
+        rows = [at(*values) for values in zip(*columns.values(), strict=True)]
+        return {name: [row[name] for row in rows] for name in nothing}
+
     words = {"outcome": {_REFUSED: "not_possible"} | _codes(MotionOutcome)}
-    return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "lockin_amplitude_nm"), words=words, alone=True)
+    return Recorder(work, 16, ("peak_amplitude_nm", "lockin_amplitude_nm"), words=words, alone=True)
 
 
-_RECORDERS: dict[str, tuple[Callable[..., Recorder], dict[str, Any]]] = {
-    "orbits": (_orbits, {"orders": (1,)}),
-    "collide": (_collisions, {APPROACH_SPEED: 30.0}),
-    "lyapunov": (_lyapunov, {"impacts": 2000, "transient": 500}),
-    "simulation": (_simulation, {"periods": 2000.0}),
+_RECORDERS: dict[str, Callable[..., Recorder]] = {
+    "orbits": _orbits,
+    "collide": _collisions,
+    "lyapunov": _lyapunov,
+    "simulation": _simulation,
 }
-"""What can be recorded of scenes, each with its settings and their usual values."""
+"""What can be recorded of scenes; the settings are the keywords, with their usual values."""
 
 # --- plan, store, run -------------------------------------------------------------------------------------------------
 
@@ -563,49 +533,39 @@ def _make(store: Path, plan: SweepPlan, results: Columns) -> None:
     """Make a Zarr group with coordinates, and arrays for results like those of a chunk."""
     import zarr  # noqa: PLC0415 (an extra package)
 
+    axes = [axis.dimension for axis in plan.axes]
+    others = [dimension_of(name) for axis in plan.axes for name in axis.columns if dimension_of(name) != axis.dimension]
     with whole_folder(store) as fresh:
-        _fill(zarr.open_group(str(fresh), mode="w", zarr_format=3), plan, results)
+        group: Any = zarr.open_group(str(fresh), mode="w", zarr_format=3)
+        group.attrs.update({"format": "afm-jax sweep", "format_version": FORMAT_VERSION, "afm_jax": __version__})
+        group.attrs.update({"input": json.dumps(plan.given)})
+        for axis in plan.axes:
+            for parameter, values in axis.columns.items():
+                about = {"parameter": parameter, "units": _unit(parameter)}
+                group.create_array(
+                    dimension_of(parameter), data=values, dimension_names=[axis.dimension], attributes=about
+                )
+        for name, values in plan.recorder.extra.items():
+            group.create_array(name, data=np.asarray(values), dimension_names=[name])
+        for name, array in results.items():
+            further, is_float = array.shape[len(axes) :], array.dtype.kind == "f"
+            is_text = array.dtype.kind == "U"
+            words = plan.recorder.words.get(name, {})
+            flags = {"flag_values": list(words), "flag_meanings": " ".join(words.values())} if words else {}
+            units = {"units": _unit(name)} if is_float else {}
+            group.create_array(
+                name,
+                shape=plan.shape + further,
+                chunks=plan.block + further,
+                dtype="string" if is_text else array.dtype,
+                fill_value="" if is_text else math.nan if is_float else 0,
+                dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
+                attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
+            )
         with warnings.catch_warnings():
             # that xarray opens the store by one file is worth a part of the format that is not settled yet
             warnings.simplefilter("ignore")
             zarr.consolidate_metadata(str(fresh))
-
-
-def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
-    about = {"format": "afm-jax sweep", "format_version": FORMAT_VERSION, "afm_jax": __version__}
-    group.attrs.update({**about, "input": json.dumps(plan.given)})
-    others = []
-    for axis in plan.axes:
-        for parameter, values in axis.columns.items():
-            name, attributes = dimension_of(parameter), {"parameter": parameter, "units": _unit(parameter)}
-            group.create_array(name, data=values, dimension_names=[axis.dimension], attributes=attributes)
-            others += [name] if name != axis.dimension else []
-    for name, values in plan.recorder.extra.items():
-        group.create_array(name, data=np.asarray(values), dimension_names=[name])
-    axes = [axis.dimension for axis in plan.axes]
-    for name, array in results.items():
-        further, is_float = array.shape[len(axes) :], array.dtype.kind == "f"
-        dtype, blank = ("string", "") if array.dtype.kind == "U" else (array.dtype, math.nan if is_float else 0)
-        words = plan.recorder.words.get(name, {})
-        flags = {"flag_values": list(words), "flag_meanings": " ".join(words.values())} if words else {}
-        units = {"units": _unit(name)} if is_float else {}
-        group.create_array(
-            name,
-            shape=plan.shape + further,
-            chunks=plan.block + further,
-            dtype=dtype,
-            fill_value=blank,
-            dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
-            attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
-        )
-
-
-class SweepRun(NamedTuple):
-    """What a run over a sweep did: chunks kept from before and those computed now, and its seconds."""
-
-    kept: int
-    computed: int
-    seconds: float
 
 
 Progress = Callable[[int, int], object]
@@ -619,11 +579,14 @@ def run_plan(
     workers: int = 1,
     scheduler: str | None = None,
     report: Progress | None = None,
-) -> SweepRun:
-    """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
+) -> tuple[int, int]:
+    """Compute what a folder does not hold yet of a sweep; return how many chunks it held, and how many are new.
+
+    Arguments and errors are as of `sweep`.
+    """
     import zarr  # noqa: PLC0415 (an extra package)
 
-    begin, regions, done = time.monotonic(), plan.regions(), 0
+    regions, done = plan.regions(), 0
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -650,7 +613,7 @@ def run_plan(
     except OSError as error:
         what = f"{error.strerror or error}: {kept + done} of {len(regions)} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
-    return SweepRun(kept, done, time.monotonic() - begin)
+    return kept, done
 
 
 def _results(
@@ -663,26 +626,23 @@ def _results(
     from distributed import as_completed  # noqa: PLC0415 (an extra package)
 
     with _client(min(workers, len(regions)), scheduler) as client:
-        work = partial(compute_chunk, json.dumps(plan.given))
+        work = partial(_computed, json.dumps(plan.given))
         for future in as_completed(client.map(work, regions, pure=False)):
             yield future.result()
 
 
-def compute_chunk(text: str, region: Region) -> tuple[Region, Columns]:
-    """Return a chunk with its results, for a process that knows nothing but the input.
-
-    Args:
-        text: `SweepPlan.given` as JSON.
-        region: of the chunk.
-
-    Raises:
-        RuntimeError: if this process would compute otherwise than the one that asks.
-    """
+def _computed(text: str, region: Region) -> tuple[Region, Columns]:
+    """Return a chunk with its results, for a process that knows nothing but the input as JSON."""
     return region, _plan_of_worker(text).compute(region)
 
 
 @lru_cache(maxsize=4)
 def _plan_of_worker(text: str) -> SweepPlan:
+    """Return the plan of an input.
+
+    Raises:
+        RuntimeError: if this process would compute otherwise than the one that asks.
+    """
     silence_xla()
     open_cache()
     given = json.loads(text)

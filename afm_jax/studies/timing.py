@@ -19,19 +19,9 @@ _SHORTEST_REPETITION_S = 0.02
 """A repetition calls the function so often that the clock's resolution and the first call's hiccups do not matter."""
 
 
-def compiled_for(
-    function: Callable[..., Any], *arguments: Any, options: dict[str, Any] | None = None
-) -> tuple[Callable[..., Any], float]:
-    """Return a function compiled for arguments of these shapes and types, and the seconds that took.
-
-    Args:
-        function: to compile.
-        arguments: of it.
-        options: of the compiler.
-    """
-    began = time.perf_counter()
-    run = jax.jit(function).lower(*arguments).compile(options)
-    return run, time.perf_counter() - began
+def compiled_for(function: Callable[..., Any], *arguments: Any, options: dict[str, Any] | None = None) -> Any:
+    """Return a function compiled for arguments of these shapes and types, with options of the compiler."""
+    return jax.jit(function).lower(*arguments).compile(options)
 
 
 def seconds_a_call(run: Callable[..., Any], *arguments: Any, repetitions: int) -> list[float]:
@@ -74,8 +64,6 @@ def _on_one_core() -> None:
         os.environ["NPROC"] = "1"
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    # compile times are part of the result, so none may come from an earlier run
-    jax.config.update("jax_enable_compilation_cache", False)  # noqa: FBT003
 
 
 def progress(message: str) -> None:

@@ -269,11 +269,10 @@ def _why_not_periodic(found: LockinResult) -> str | None:
     order = found.order
     amplitude = found.lockin_amplitude_nm
     sizes = np.nan_to_num(found.amplitudes_nm)
-    # lines of a motion of the order are at its divisors
-    own = order % found.orders == 0
     # errors of few blocks are uncertain: noise is alike at all lines
     noise = _SEEN * float(np.nanmax(found.amplitude_errors_nm))
-    other, most = (int(np.argmax(np.where(own == which, sizes, -1.0))) for which in (False, True))
+    # lines of a motion of the order are at its divisors
+    other, largest = int(np.argmax(np.where(order % found.orders == 0, -1.0, sizes))), int(np.argmax(sizes))
     if sizes[other] > max(found.largest_share * amplitude, noise, _SILENT_NM):
         n = found.orders[other]
         return (
@@ -287,10 +286,8 @@ def _why_not_periodic(found: LockinResult) -> str | None:
             f"parts of the trace differ by {found.scatter:.1%} (at most {SHARE:.0%}): it still settles, drifts, or "
             "never repeats, the drive frequency is wrong, or the noise is large; record longer, later"
         )
-    if sizes[most] > amplitude:
-        n = found.orders[most]
-        return f"the response is larger at the drive's frequency over {n}: use `order={n}`"
-    return None
+    n = found.orders[largest]
+    return None if n == order else f"the response is larger at the drive's frequency over {n}: use `order={n}`"
 
 
 TRACE = Form(

@@ -3,8 +3,7 @@
 Hard: 32 bits are what JAX has until it is told otherwise, nothing warns, and a chaotic or an ill-conditioned answer
 looks like any other.
 
-Right answers: the same call in 64 bits, which is compared with independent ones elsewhere. The digits that next
-impacts keep when 32 bits are asked for on purpose are in tests/test_contracts.py.
+Right answers: the same call in 64 bits, which is compared with independent ones elsewhere.
 """
 
 from collections.abc import Callable
