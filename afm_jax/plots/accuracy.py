@@ -15,7 +15,7 @@ def accuracy_figure(study: AccuracyStudy) -> Figure:
 
     Errors of 1 and more are left out: no more than that they are wrong is known.
     """
-    figure, panels = new_panels(11.0, 5.0, 1, 2, sharey=True)
+    figure, panels = new_panels(7.0, 8.5, 2)
     known = [row for row in study.rows if row["error"] is not None and row["error"] < 1.0]
     doubts = {"value": study.reference_error, "gradient": study.reference_gradient_error}
     for axes, (kind, doubt) in zip(panels, doubts.items(), strict=True):
@@ -28,7 +28,10 @@ def accuracy_figure(study: AccuracyStudy) -> Figure:
             axes.axvline(doubt, color=DARK, linestyle=":", label="error of the reference")
         axes.set(xscale="log", yscale="log", title=kind)
         axes.invert_xaxis()
-        label_axes(axes, x=f"error of the {'' if kind == 'value' else 'gradient of the '}{study.value_of}", y="")
-    panels[0].set_ylabel("time (µs), one core")
+        label_axes(
+            axes,
+            x=f"error of the {'' if kind == 'value' else 'gradient of the '}{study.value_of}",
+            y="time (µs), one core",
+        )
     panels[0].legend(frameon=False)
     return figure
