@@ -22,7 +22,7 @@ from afm_jax.units import TWO_SIDED_95
 from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch
 from fitting.tapping_curves.curve import Instrument, Mask, Rows, TappingCurve
 from fitting.tapping_curves.energy import Energies, energies
-from fitting.tapping_curves.lever import Lever, Nuisance, LeverUnknown
+from fitting.tapping_curves.lever import Lever, LeverUnknown, Nuisance
 from fitting.tapping_curves.smooth import SHALLOW, Smoother, size_of, smoothed
 
 _FAR, _MOST_OUTLIERS = 4.0, 0.2
