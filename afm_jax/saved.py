@@ -120,10 +120,10 @@ def load(path: str | Path) -> Any:
 
     try:
         payload = json.loads(read_whole(path).decode("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         refuse(f"is no JSON ({error})")
     if not isinstance(payload, dict) or not {"format", "type", "fields"} <= set(payload):
-        refuse("is no saved result; `.save(path)` of a result writes one")
+        refuse("is no saved result; `.save(path)` of a result, or --out of its command, writes one")
     if payload["format"] == FORMAT and payload.get("format_version") != FORMAT_VERSION:
         refuse(
             f"has format_version {payload.get('format_version')}, but {FORMAT_VERSION} is known here: update afm-jax"

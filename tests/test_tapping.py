@@ -13,15 +13,11 @@ import fitting
 from afm_jax.cli.main import main
 from afm_jax.saved import as_json
 from fitting.tables.csv_text import TableError
+from fitting.tapping_curves.along import positive_bands, said_of
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
-from fitting.tapping_curves.energy import (
-    Lever,
-    energies,
-    largest_energies,
-    positive_bands,
-    said_of,
-)
+from fitting.tapping_curves.energy import energies, largest_energies
+from fitting.tapping_curves.lever import Lever
 from fitting.tapping_curves.tapping import tapping
 from tests.answers import answer
 from tests.html_pages import first_screen, read_page

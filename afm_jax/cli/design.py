@@ -52,8 +52,8 @@ def planned(  # noqa: PLR0913
         detunings: drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where
             the tip is driven, else 1.02:1.1:0.02.
         amplitudes_nm: drive amplitudes, else 2,4,7,10; or free ones, else 40,80.
-        offsets_nm: offsets; else -1,0,1.
-        heights: where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude;
+        offsets_nm: offsets, where the sample is driven; else -1,0,1.
+        heights: where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude,
             else 0.1:0.9:0.1.
         largest_nm: largest peak amplitude that the instrument can measure.
         points: how many to choose.
@@ -62,7 +62,7 @@ def planned(  # noqa: PLR0913
         phase_noise_deg: error of a lag where the tip is driven.
         amplitudes: the readings of a point.
         uncertainty: error of the law that is assumed where no fit gives one.
-        fit: a fit to add to, as `afm-jax fit --json` writes it, or its folder.
+        fit: a fit to add to, the fit.json of `afm-jax fit --out`, or its folder.
         model: what will be fitted, of the models of `fit`; else law+delay, or the fit's.
         mass_ng: effective mass of the tip.
         drive: what is driven; else the sample.

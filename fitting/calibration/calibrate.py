@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
@@ -18,7 +17,7 @@ from afm_jax.saved import as_json
 from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import counted, decimals, with_error
+from afm_jax.words import counted, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import Resonance, read_resonance
@@ -89,11 +88,10 @@ class Calibration(JudgedResult):
         """The comment lines that carry the calibration into an amplitude table; none if it is not valid."""
         if not self.valid:
             return []
-        # three digits of the error: it enters every amplitude of a table
-        places = max(decimals(0.1 * (self.frequency_khz.standard_error or 0.0), unknown=12), 3)
         sure = [one for one in self.spring_constant_n_per_m.values() if one.standard_error is not None]
         return [
-            f"# free_frequency_khz = {self.frequency_khz.value:.{places}f}",
+            # more digits than its error has: it enters every amplitude of a table
+            f"# free_frequency_khz = {self.frequency_khz.value:.9g}",
             f"# quality_factor = {self.quality_factor.in_words}",
             *(f"# spring_constant_n_per_m = {one.in_words}" for one in sure[:1]),
         ]
@@ -176,8 +174,7 @@ def calibrate(
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
     given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}
-    pairs = {name: given_value(name, one) for name, one in given.items() if one is not None}
-    known = {name: (value, error or 0.0) for name, (value, error) in pairs.items()}
+    known = {name: given_value(name, one) for name, one in given.items() if one is not None}
     if ("length_um" in known) != ("width_um" in known):
         raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
     sweep = replace(sweep, averages=averages or sweep.averages)
@@ -204,44 +201,41 @@ def _check_sweep(sweep: Resonance) -> None:
 def _fitted(sweep: Resonance) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, with what makes it invalid and its warnings."""
     largest = float(sweep.amplitude.max())
-    averages = sweep.averages if sweep.spectrum else None
     # without errors they are what makes chi2/dof 1
-    error = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01)
-    size = 1.0
-    origin = "estimated"
-    if averages is not None:
+    error, size, origin = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01), 1.0, "estimated"
+    if sweep.spectrum and sweep.averages is not None:
         # the mean of a term of the gamma deviance is a little above 1
-        size, origin = 2.0 * averages * (np.log(averages) - digamma(averages)), "averages"
-        error = error * averages**-0.5
+        size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages))
+        error, origin = error * sweep.averages**-0.5, "averages"
     elif sweep.amplitude_error is not None:
         error, origin = sweep.amplitude_error / largest, "file"
     (place, best, _, distance), model, reverse = minimum(sweep, error)
     freedom = len(best.residual) - len(place)
     # a scan without noise keeps rounding for an error
     scale = max(best.value / freedom, 1e-12) if origin == "estimated" else 1.0
+    chi2 = best.value / scale
     p_value = np.nan if origin == "estimated" else chi2_tail(best.value / size, freedom)
-    together = _autocorrelation(best.residual.reshape(-1, sweep.points))
+    neighbours = best.residual.reshape(-1, sweep.points)
+    together = float(np.sum(neighbours[:, 1:] * neighbours[:, :-1])) / max(best.value, 1e-12 * neighbours.size)
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
-    fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(best.residual)) < together < 1.0 else 1.0
-    covariance = covariance_of(best.jacobian.T @ best.jacobian)
+    fewer = (1.0 + together) / (1.0 - together) if together > 3.0 / np.sqrt(neighbours.size) else 1.0
+    covariance = scale * fewer * covariance_of(best.jacobian.T @ best.jacobian)
     natural, quality_factor = np.exp(place[:2]).tolist()
 
     def known(value: float, *slopes: float) -> CalibratedValue:
         """Return a value whose logarithm has these derivatives by the first of the place."""
         used = np.flatnonzero(slopes)
         by = np.array(slopes)[used]
-        variance = scale * fewer * float(by @ covariance[np.ix_(used, used)] @ by)
+        variance = float(by @ covariance[np.ix_(used, used)] @ by)
         # the variance of a logarithm
         if not variance < 20.0:
             return CalibratedValue(value, None, reason="the scan does not determine it")
-        if p_value < IMPROBABLE:
-            return CalibratedValue(value, None, reason="the model does not explain the scan")
         return _known_to(value, float(np.sqrt(variance)))
 
     # the integral of a |L|^2 over all frequencies
     area = float(0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2)
     frequency, quality = known(natural, 1.0), known(quality_factor, 0.0, 1.0)
-    chi2, unknown = best.value / scale, frequency.reason or quality.reason
+    unknown = frequency.reason or quality.reason
     half, apart = 0.5 * natural / quality_factor, sweep.frequency_khz - natural
     near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
     khz, inside = f"{natural:.6g} kHz", f"{counted(count, 'point')} within the half-width"
@@ -267,7 +261,6 @@ def _fitted(sweep: Resonance) -> Calibration:
             "background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
         )
     notes = {
-        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural > 2e4,
         "The phase rises through the resonance: its sign was reversed.": reverse,
         f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": sweep.spectrum and count < 3,
     }
@@ -286,12 +279,6 @@ def _fitted(sweep: Resonance) -> Calibration:
         reasons=tuple(reasons),
         warnings=tuple(said for said, holds in notes.items() if holds),
     )
-
-
-def _autocorrelation(residual: Float[np.ndarray, "kinds points"]) -> float:
-    """Return the correlation of residuals of neighbouring points; 0 where there is no misfit but rounding."""
-    total = float(np.sum(residual**2))
-    return float(np.sum(residual[:, 1:] * residual[:, :-1])) / total if total > 1e-12 * residual.size else 0.0
 
 
 def _of_spectrum(sweep: Resonance) -> Calibration:
@@ -325,7 +312,7 @@ def _of_spectrum(sweep: Resonance) -> Calibration:
 
 
 def _springs(
-    found: Calibration, known: dict[str, tuple[float, float]], scale_error: float, *, static: bool
+    found: Calibration, known: dict[str, tuple[float, float | None]], scale_error: float, *, static: bool
 ) -> dict[str, CalibratedValue]:
     """Return the spring constants that a calibration supports; that by equipartition without error if contradicted.
 
@@ -339,27 +326,28 @@ def _springs(
     if None in (error for _, error in read):
         return {}
     springs, mean = {}, found.mean_square_nm2
-    who = "the instrument"
-    wanted = found.sweep.instrument.get("spring_constant_n_per_m")
-    share = 0.1
+    who, wanted, share = "the instrument", found.sweep.instrument.get("spring_constant_n_per_m"), 0.1
     if "length_um" in known:
-        centre, errors = np.array([*read, *known.values()]).T
+        centre, errors = np.array([*read, *known.values()], float).T
         who, wanted = "Sader's method", sader(*centre)
-        share = float(np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(errors)]))
+        share = float(
+            np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(np.nan_to_num(errors))])
+        )
         springs["sader"] = _known_to(wanted, share)
-    if mean is not None and mean.standard_error is not None:
-        warm, warm_error = known["temperature_k"]
-        value = equipartition(mean.value, warm, static=static)
-        own = float(np.linalg.norm((mean.standard_error / mean.value, warm_error / warm, 2.0 * scale_error)))
-        springs["equipartition"] = _known_to(value, own)
-        apart = 0.0 if wanted is None else float(np.log(value / wanted))
-        # neither is better than 5 %
-        if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
-            doubt = (
-                f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
-                f"are {np.exp(-0.5 * apart):.3g} times the true ones"
-            )
-            springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
+    if mean is None or mean.standard_error is None:
+        return springs
+    warm, warm_error = known["temperature_k"]
+    value = equipartition(mean.value, warm, static=static)
+    own = float(np.linalg.norm((mean.standard_error / mean.value, (warm_error or 0.0) / warm, 2.0 * scale_error)))
+    springs["equipartition"] = _known_to(value, own)
+    apart = 0.0 if wanted is None else float(np.log(value / wanted))
+    # neither is better than 5 %
+    if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
+        doubt = (
+            f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
+            f"are {np.exp(-0.5 * apart):.3g} times the true ones"
+        )
+        springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
     return springs
 
 

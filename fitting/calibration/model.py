@@ -17,6 +17,7 @@ An averaged periodogram of K spectra scatters as a gamma distribution: -2 log L 
 measured/fitted density. Each term is the square of a residual, so that least squares maximises the likelihood.
 """
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -27,8 +28,6 @@ from fitting.calibration.sweep import Resonance
 
 Points = Float[np.ndarray, " points"]
 Response = Complex[np.ndarray, " points"]
-_LEAST_SQUARE = 1e-12
-"""Of a modelled square, in units of the largest: a trial step may leave less, or a negative one, whose root is none."""
 
 
 def measured_response(sweep: Resonance) -> Response:
@@ -47,15 +46,18 @@ def response(frequency: Float[np.ndarray, " n"], natural: float, quality_factor:
     return np.stack([shape, by_natural, -shape + shape * damping / below], axis=1)
 
 
-def _terms(sweep: Resonance, natural: float, quality_factor: float) -> Complex[np.ndarray, "n terms 3"]:
-    """Return what the linear parameters multiply, and its derivatives by ln f0 and ln Q."""
+def _terms(sweep: Resonance, natural: float, quality_factor: float) -> Float[np.ndarray, "n terms 3"]:
+    """Return what the linear parameters multiply, and its derivatives by ln f0 and ln Q.
+
+    The sum is z, all its real parts and below them all imaginary ones, or |z|^2.
+    """
     shape = response(sweep.frequency_khz, natural, quality_factor)
     constant = np.ones((sweep.points, 1)) * [1.0, 0.0, 0.0]
     if sweep.model == "phase":
         columns = [shape, constant, sweep.position[:, None] * constant]
-        return np.stack([turn * column for column in columns for turn in (1.0, 1j)], axis=1)
+        return _parts(np.stack([turn * column for column in columns for turn in (1.0, 1j)], axis=1))
     square = np.real(np.conj(shape[:, :1]) * shape) * [1.0, 2.0, 2.0]
-    return np.stack([square, constant, np.real(shape)], axis=1).astype(complex)
+    return np.stack([square, constant, np.real(shape)], axis=1)
 
 
 def deviance_root(ratio: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -69,45 +71,40 @@ def _parts(numbers: Complex[np.ndarray, "n ..."]) -> Float[np.ndarray, "m ..."]:
     return np.concatenate([np.real(numbers), np.imag(numbers)])
 
 
-def _evaluate(
-    sweep: Resonance, measured: Response, error: Points, place: Float[np.ndarray, " p"]
-) -> tuple[Sum, Response]:
-    """Return chi2 and the model at ln f0, ln Q and the linear parameters; arguments as of `_linear`."""
+def _evaluate(sweep: Resonance, wanted: Float[np.ndarray, " n"], error: Points, place: Float[np.ndarray, " p"]) -> Sum:
+    """Return chi2 at ln f0, ln Q and the linear parameters; arguments as of `minimum`."""
     terms = _terms(sweep, *np.exp(place[:2]).tolist())
     values = np.einsum("ntd,t->nd", terms, place[2:])
     model, slopes = values[:, 0], np.concatenate([values[:, 1:], terms[:, :, 0]], axis=1)
     if sweep.model == "phase":
-        residual, slopes = _parts((model - measured) / error), _parts(slopes / error[:, None])
-        return Sum(float(residual @ residual), residual, slopes), model
-    square = np.maximum(np.real(model), _LEAST_SQUARE)
-    slopes = np.where(np.real(model)[:, None] > _LEAST_SQUARE, np.real(slopes), 0.0)
-    model, size = np.sqrt(square), np.abs(measured)
-    if sweep.model == "amplitude":
-        residual, steep = model - size, 0.5 / model
+        residual, steep, error = model - wanted, np.ones_like(model), np.tile(error, 2)
     else:
-        ratio = size**2 / square
+        # a trial step may leave nothing of a square, or a negative one, whose root is none
+        model = np.maximum(model, 1e-12)
+        residual = np.sqrt(model) - np.sqrt(wanted)
+        steep = 0.5 / np.sqrt(model)
+    if sweep.model == "power":
+        ratio = wanted / model
         residual = -deviance_root(ratio)
-        steep = np.divide(1.0 - ratio, residual, out=np.ones_like(ratio), where=residual != 0.0) / square
+        steep = np.divide(1.0 - ratio, residual, out=np.ones_like(ratio), where=residual != 0.0) / model
     residual, slopes = residual / error, slopes * (steep / error)[:, None]
-    return Sum(float(residual @ residual), residual, slopes), model + 0j
+    return Sum(float(residual @ residual), residual, slopes)
 
 
 def _linear(
-    sweep: Resonance, measured: Response, natural: float, quality_factor: float
+    sweep: Resonance, wanted: Float[np.ndarray, " n"], natural: float, quality_factor: float
 ) -> tuple[float, Float[np.ndarray, " p"]]:
     """Return the sum of squares about which the best place for a frequency and a quality factor leaves, and it."""
-    columns = _terms(sweep, natural, quality_factor)[:, :, 0]
-    if sweep.model == "phase":
-        design, wanted = _parts(columns), _parts(measured)
-    else:
-        # weighted such that the errors are about those of the amplitude, or of the density
-        size = np.maximum(np.abs(measured), 1e-6)
+    weight = np.ones(len(wanted))
+    if sweep.model != "phase":
+        # such that the errors are about those of the amplitude, or of the density
+        size = np.maximum(np.sqrt(wanted), 1e-6)
         weight = 1.0 / (size**2 if sweep.model == "power" else 2.0 * np.maximum(size, 0.03))
-        design, wanted = weight[:, None] * np.real(columns), weight * np.abs(measured) ** 2
-    found = np.linalg.lstsq(design, wanted, rcond=1e-9)[0]
+    design = weight[:, None] * _terms(sweep, natural, quality_factor)[:, :, 0]
+    found = np.linalg.lstsq(design, weight * wanted, rcond=1e-9)[0]
     # a negative square is a dip, no resonance
     dip = sweep.model != "phase" and found[0] <= 0.0
-    chi2 = np.inf if dip else float(np.sum((design @ found - wanted) ** 2))
+    chi2 = np.inf if dip else float(np.sum((design @ found - weight * wanted) ** 2))
     return chi2, np.array([np.log(natural), np.log(quality_factor), *found])
 
 
@@ -130,17 +127,19 @@ def minimum(sweep: Resonance, error: Points) -> tuple[Lowest, Response, bool]:
     # half of them lie around the largest amplitude, where a peak narrower than the grid would be
     near = np.clip(peak + step * np.linspace(-3.0, 3.0, 13), frequency[0], frequency[-1])
     grid = product(
-        (measured,) if sweep.phase_deg is None else (measured, np.conj(measured)),
+        [_parts(measured), _parts(np.conj(measured))] if sweep.model == "phase" else [np.abs(measured) ** 2],
         [*np.linspace(frequency[0], frequency[-1], 12).tolist(), *near.tolist()],
         np.maximum(frequency.mean() / np.geomspace(0.3 * step, 3.0 * span, 10), 0.6).tolist(),
     )
     starts = ((*_linear(sweep, *place), place[0]) for place in grid)
-    _, start, signed = min(starts, key=lambda start: start[0])
+    _, start, wanted = min(starts, key=lambda start: start[0])
     longest = np.append([1.0, 1.0], np.full(len(start) - 2, np.inf))
-    best = levenberg_marquardt(
-        lambda place: _evaluate(sweep, signed, error, place)[0], start, settled=1e-20, most=100, longest=longest
-    )
-    return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
+    evaluate = partial(_evaluate, sweep, wanted, error)
+    best = levenberg_marquardt(evaluate, start, settled=1e-20, most=100, longest=longest)
+    model = _terms(sweep, *np.exp(best.place[:2]).tolist())[:, :, 0] @ best.place[2:]
+    if sweep.model != "phase":
+        return best, np.sqrt(model) + 0j, False
+    return best, np.array([1.0, 1j]) @ model.reshape(2, -1), bool(np.any(wanted != _parts(measured)))
 
 
 def chi2_without_resonance(sweep: Resonance, error: Points) -> float:

@@ -125,8 +125,8 @@ class Resonance(Result):
     def within(self, low_khz: float, high_khz: float) -> "Resonance":
         """Return the points between two frequencies; of a spectrum those that are above zero."""
         kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
+        columns = {name: column[kept] for name in _COLUMNS if (column := getattr(self, name)) is not None}
+        return replace(self, **columns)
 
 
 @checked
@@ -165,16 +165,15 @@ def _sweep_of(recording: Recording) -> Resonance:
         # in this package's unit, by what it measures, and by its name, too
         for key in (kind, f"{kind}: {name}"):
             found.setdefault(key, numbers * size)
-    khz, spectrum = found.get("frequency"), "spectrum" in found
-    if "frequency: Frequency Shift" in found:
-        centre = found.get("frequency: Center Frequency")
-        khz = None if centre is None else found["frequency: Frequency Shift"] + centre
-    amplitude = found.get("spectrum" if spectrum else "length: Amplitude")
+    khz, amplitude = found.get("frequency"), found.get("spectrum", found.get("length: Amplitude"))
+    if "frequency: Frequency Shift" in found and khz is not None:
+        khz = found["frequency: Frequency Shift"] + found.get("frequency: Center Frequency", np.nan)
     if khz is None or amplitude is None:
         raise TableError(
             f"{recording.source}: holds neither a thermal spectrum nor an amplitude in m over the frequency (or its "
             f"shift and the center frequency), but {', '.join(recording.channels)}"
         )
+    spectrum = "spectrum" in found
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
     used = (khz > 0.0) & (amplitude > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
     phase = None if spectrum else found.get("angle: Phase")

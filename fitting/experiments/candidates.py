@@ -29,11 +29,12 @@ PHASE_NOISE_DEG = 0.2
 """Standard error of a lag, where nothing is said of it."""
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
-_USUAL = {
-    True: ((1, 2, 3, 4), np.arange(97, 106) / 100, (2.0, 4.0, 7.0, 10.0), (-1.0, 0.0, 1.0)),
-    False: ((1,), (1.02, 1.04, 1.06, 1.08, 1.1), (40.0, 80.0), np.arange(1, 10) / 10),
+_USUAL: dict[bool, dict[str, Numbers]] = {
+    True: {"orders": (1, 2, 3, 4), "detunings": np.arange(97, 106) / 100, "amplitudes_nm": (2.0, 4.0, 7.0, 10.0)},
+    False: {"orders": (1,), "detunings": (1.02, 1.04, 1.06, 1.08, 1.1), "amplitudes_nm": (40.0, 80.0)},
 }
-"""Orders, detunings, amplitudes and offsets or heights that are tried if nothing is said; True: of a driven sample."""
+_USUAL[True]["offsets_nm"], _USUAL[False]["heights"] = (-1.0, 0.0, 1.0), np.arange(1, 10) / 10
+"""What is tried if nothing is said; True: of a driven sample."""
 
 
 @checked
@@ -56,43 +57,35 @@ def drive_grid(
         amplitudes_nm: of the platform, else 2, 4, 7, 10; of the free tip where that is driven, else 40, 80.
         detunings: drive frequencies as multiples of each order's resonance 2 N f0, else 0.97 to 1.05; of f0 where the
             cantilever is driven itself, else 1.02 to 1.1.
-        offsets_nm: mean heights of the platform above the tip's rest position; else -1, 0, 1.
-        heights: in place of the offsets, distances of the sample from the rest position of a tip that is driven itself,
-            as shares of its free amplitude, else 0.1 to 0.9; 0.9 is where it begins to tap.
+        offsets_nm: where the sample is driven, its mean heights above the tip's rest position; else -1, 0, 1.
+        heights: where the tip is driven, distances of the sample from its rest position as shares of its free
+            amplitude, else 0.1 to 0.9; 0.9 is where it begins to tap.
 
     Raises:
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    sample = drive == "sample"
-    if heights is not None and (sample or offsets_nm is not None):
-        instead = "give `offsets_nm` where the sample is driven, and one of the two where the tip is"
-        raise ValueError(f"`heights` are shares of a free amplitude: {instead}")
     check_parameter("free_frequency_khz", free_frequency_khz, "positive")
-    names = ("orders", "detunings", "amplitudes_nm", "offsets_nm" if heights is None else "heights")
-    asked = (orders, detunings, amplitudes_nm, offsets_nm if heights is None else heights)
-    lists = [usual if given is None else given for usual, given in zip(_USUAL[sample], asked, strict=True)]
-    for name, values in zip(names, lists, strict=True):
-        check_parameter(name, np.asarray(values), "finite" if name == names[-1] else "positive")
-    if any(order != int(order) or not (sample or order == 1) for order in lists[0]):
+    sample = drive == "sample"
+    asked = {"orders": orders, "detunings": detunings, "amplitudes_nm": amplitudes_nm}
+    asked |= {"offsets_nm": offsets_nm, "heights": heights}
+    lists = _USUAL[sample] | {name: values for name, values in asked.items() if values is not None}
+    if len(lists) > 4:
+        raise ValueError("give `offsets_nm` where the sample is driven, `heights` where the tip is")
+    for name, values in lists.items():
+        check_parameter(name, np.asarray(values), "finite" if name in ("offsets_nm", "heights") else "positive")
+    if any(order != int(order) or not (sample or order == 1) for order in lists["orders"]):
         allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
-        raise ValueError(f"`orders` must hold {allowed}, but is {list(lists[0])}")
-    count = math.prod(map(len, lists))
+        raise ValueError(f"`orders` must hold {allowed}, but is {list(lists['orders'])}")
+    count = math.prod(map(len, lists.values()))
     if count > MOST:
         raise ValueError(f"these are {count} drives, more than the {MOST} a design looks at; take coarser steps")
-    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in np.meshgrid(*lists))
+    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in np.meshgrid(*lists.values()))
     frequency = (2.0 if sample else 1.0) * free_frequency_khz * order * detuning
-    offset = place if sample or offsets_nm is not None else -place * amplitude
     # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
-    columns = np.unique(np.round([order, frequency, amplitude, offset], 6), axis=1)
+    rows = [order, frequency, amplitude, place if sample else -place * amplitude]
+    columns = np.unique(np.round(rows, 6), axis=1)
     return Drives(columns[0].astype(np.int64), *columns[1:])
-
-
-def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.ndarray:
-    """Say which drives are among others, given as rows of order, frequency, amplitude and offset."""
-    # no instrument sets nine digits
-    places = np.stack(drives, axis=1)[:, None]
-    return np.any(np.all(np.isclose(places, others, rtol=1e-9, atol=1e-12), axis=2), axis=1)
 
 
 LEFT_OUT = {
@@ -218,8 +211,10 @@ def candidates_of(prior: Prior, drives: Drives, rows: Explained, largest_nm: flo
         sure &= (found.number == 1) & (np.abs(found.orbits.fold) > NEAR_FOLD)
     slope = rows.end.jacobian.reshape(len(sure), READINGS, -1)
     size = drives.amplitude_nm if prior.problem.tapping else orbits.readings[:, 0]
+    # no instrument sets nine digits
+    same = np.all(np.isclose(np.stack(drives, axis=1)[:, None], prior.measured, rtol=1e-9, atol=1e-12), axis=2)
     holds = {
-        "measured": same_drives(drives, prior.measured),
+        "measured": np.any(same, axis=1),
         "no orbit": number == 0,
         "unsure": ~sure | ~np.isfinite(slope).all(axis=(1, 2)),
         "too large": size > largest_nm,

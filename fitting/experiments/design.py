@@ -6,6 +6,7 @@ such that the joint confidence region of the parameters that matter becomes smal
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +15,11 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import check_count, check_parameter, checked, in_float64
 from afm_jax.columns import CsvColumns, csv_columns, rows_of
 from afm_jax.impact.law import extrapolation_of
-from afm_jax.report import Bullets, Section, Table, sections
+from afm_jax.report import Bullets, Cell, Section, sections, table_of
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.saved import as_json
 from afm_jax.strict_json import plain
-from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import known, with_error
+from afm_jax.words import with_error
 from fitting.experiments.candidates import (
     LEFT_OUT,
     PHASE_NOISE_DEG,
@@ -38,19 +38,18 @@ from fitting.simulated.experiment import Drives
 _EXACT = "The quality factor is taken as exact, which makes forecasts too good: give its error, as '40 +- 2'."
 
 
-_EXPECTED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg", "approach_speed_nm_per_us")
-_SHOWN = {
-    "order": ("N", "d"),
-    "drive_frequency_khz": ("kHz", ".8g"),
-    "drive_amplitude_nm": ("nm", ".5g"),
-    "free_amplitude_nm": ("free nm", ".5g"),
-    "offset_nm": ("offset", ".4g"),
-    "expected_peak_amplitude_nm": ("peak nm", ".2f"),
-    "expected_lockin_amplitude_nm": ("lock-in nm", ".2f"),
-    "expected_phase_lag_deg": ("lag deg", ".2f"),
-    "expected_approach_speed_nm_per_us": ("u_in", ".1f"),
+_SHOWN: dict[str, Cell] = {
+    "N": "order:d",
+    "kHz": "drive_frequency_khz:.8g",
+    "nm": "drive_amplitude_nm:.5g",
+    "free nm": "free_amplitude_nm:.5g",
+    "offset": "offset_nm:.4g",
+    "peak nm": "expected_peak_amplitude_nm:.2f",
+    "lock-in nm": "expected_lockin_amplitude_nm:.2f",
+    "lag deg": "expected_phase_lag_deg:.2f",
+    "u_in": "expected_approach_speed_nm_per_us:.1f",
 }
-"""Head and format of the columns that are printed."""
+"""Columns that are printed, with their formats, as far as there are such readings."""
 
 
 @public_result(picture="fitting.experiments.picture:design_figure")
@@ -89,12 +88,12 @@ class Design(JudgedResult):
         """The drives under the names of a table's columns, and the readings to expect."""
         found, amplitude = self.candidates, "free" if self.prior.problem.tapping else "drive"
         names = "order", "drive_frequency_khz", f"{amplitude}_amplitude_nm", "offset_nm"
-        columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
+        readings = "peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg", "approach_speed_nm_per_us"
         expected = [*found.readings[self.chosen].T, found.approach_speed_nm_per_us[self.chosen]]
-        for name, column in zip(_EXPECTED, expected, strict=True):
-            if np.isfinite(column).all():
-                columns[f"expected_{name}"] = column
-        return {name: column.tolist() for name, column in columns.items()}
+        columns = dict(
+            zip((*names, *(f"expected_{name}" for name in readings)), [*self.drives, *expected], strict=True)
+        )
+        return {name: column.tolist() for name, column in columns.items() if np.isfinite(column).all()}
 
     def points(self) -> list[dict[str, Any]]:
         """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
@@ -102,32 +101,22 @@ class Design(JudgedResult):
         return rows_of({**self.columns, "standard_errors": [dict(zip(names, row, strict=True)) for row in errors]})
 
     @property
-    def measured_so_far(self) -> dict[str, dict[str, Any]]:
-        """How well every parameter is known now: value, unit, standard error and 95 % interval."""
-        return self._known_after(0)
-
-    @property
     def expected(self) -> dict[str, dict[str, Any]]:
-        """How well every parameter will be known once the points are measured."""
-        return self._known_after(-1)
-
-    def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
-        parameters, values = self.prior.problem.parameters, self.prior.values
-        errors = np.where(np.isfinite(self.errors[count]), self.errors[count], np.nan)
-        lowest, highest = np.array([(known.lowest, known.highest) for known in parameters]).T
-        half = TWO_SIDED_95 * errors
-        columns = {
-            "value": values,
-            "unit": [known.unit for known in parameters],
-            "standard_error": errors,
-            "interval95": np.clip([values - half, values + half], lowest, highest).T,
+        """Value and unit of every parameter, and its standard error once the points are measured."""
+        entries = zip(self.prior.problem.parameters, self.prior.values, plain(self.errors[-1]), strict=True)
+        return {
+            one.name: {"value": float(value), "unit": one.unit, "standard_error": error}
+            for one, value, error in entries
         }
-        return dict(zip(self.prior.problem.names, plain(rows_of(columns)), strict=True))
+
+
+def _error_after(name: str, point: dict[str, Any]) -> float | None:
+    return point["standard_errors"][name]
 
 
 @as_json.register
 def _(plan: Design) -> dict[str, Any]:
-    names = ("valid", "reasons", "warnings", "noise", "interest", "expected", "measured_so_far")
+    names = ("valid", "reasons", "warnings", "noise", "interest", "expected")
     return {
         "format": "afm-jax design",
         "format_version": 2,
@@ -148,11 +137,10 @@ def _(plan: Design) -> CsvColumns:
 
 @sections.register
 def _(plan: Design) -> list[Section]:
-    columns, points, problem = plan.columns, plan.points(), plan.prior.problem
-    shown = {name: style for name, style in _SHOWN.items() if name in columns}
-    table = {head: [f"{value:{form}}" for value in columns[name]] for name, (head, form) in shown.items()}
+    points, problem = plan.points(), plan.prior.problem
+    cells = {head: cell for head, cell in _SHOWN.items() if str(cell).partition(":")[0] in plan.columns}
     for name in plan.interest[:4]:
-        table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
+        cells[f"+- {name}"] = partial(_error_after, name)
     after = [
         f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
         for name, entry in plan.expected.items()
@@ -163,7 +151,7 @@ def _(plan: Design) -> list[Section]:
     why = [f"{count} left out: {LEFT_OUT[name]}" for name, count in left_out.items()]
     return [
         Section(f"{title} ({problem.model}, {plan.prior.source})", []),
-        Section("Points", [Table("", [*table], [*zip(*table.values(), strict=True)]), said]),
+        Section("Points", [table_of(cells, points, form=".2g"), said]),
         Section("Forecast", [f"After all: {', '.join(after)}"]),
         Section("Drives", [Bullets(why, f"{usable.sum()} of {usable.size} drives can be planned with.")]),
     ]

@@ -3,26 +3,24 @@
 A fit leaves one: its values, its covariance, and the drives that were measured.
 """
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.law import TabulatedLaw, law_of_dict
+from afm_jax.impact.law import TabulatedLaw
 from afm_jax.results import Result, public_result
-from afm_jax.saved import as_json, why_no_fit
+from afm_jax.saved import load
 from afm_jax.words import printable
-from fitting.infer.result import FitResult
+from fitting.infer.result import FitResult, FittedParameter
 from fitting.models import Problem, check_constraints
-from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values
+from fitting.parameters import NUISANCE_NAMES, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
-from fitting.tables.csv_text import FARTHEST, TableError, read_bytes
+from fitting.tables.csv_text import TableError
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -148,13 +146,11 @@ def _checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.n
     Raises:
         TableError: if one is outside of what its parameter can be.
     """
-    for parameter in problem.parameters:
-        value = values[parameter.name]
+    for known in problem.parameters:
+        value = values[known.name]
         # NaN is in no range
-        if not parameter.lowest <= value <= parameter.highest:
-            raise TableError(
-                f"{parameter.name} must be between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
-            )
+        if not known.lowest <= value <= known.highest:
+            raise TableError(f"{known.name} must be between {known.lowest:g} and {known.highest:g}, but is {value!r}")
     return np.array([float(values[name]) for name in problem.names])
 
 
@@ -162,84 +158,58 @@ def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> Prior:
     """Return the prior that a saved fit leaves.
 
     Args:
-        path: what `afm-jax fit --json` prints, or the fit.json of its report.
+        path: the fit.json of `afm-jax fit --out`, or what a fit's method `save` wrote.
         uncertainty: how far values may be off, relative, where the fit does not say.
 
     Raises:
-        TableError: if the file cannot be read, or is no fit.
+        ValueError: if the file cannot be read, or is no fit.
     """
-    data = read_bytes(path, "a fit.json")
-    try:
-        payload = json.loads(data)
-        wrong = why_no_fit(payload)
-        prior = prior_of_fit(payload, uncertainty) if wrong is None else None
-    except TableError as error:
-        raise TableError(f"{printable(str(path))}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        # no JSON, or an entry of another kind than `afm-jax fit` writes there
-        mend = "give the fit.json of `afm-jax fit --out`, or fit the table again"
-        raise TableError(f"{printable(str(path))}: the saved fit is damaged; {mend}") from error
-    if prior is None:
-        raise TableError(f"{printable(str(path))}: {wrong}")
-    return prior
+    fit = load(path)
+    if not isinstance(fit, FitResult):
+        raise TableError(f"{printable(str(path))}: is no fit; give the fit.json of `afm-jax fit --out`")
+    return prior_of_fit(fit, uncertainty)
 
 
-def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Prior:
+def prior_of_fit(fit: FitResult, uncertainty: float = UNCERTAINTY) -> Prior:
     """Return the prior that a fit leaves: its values, its covariance, and the drives that it used.
 
-    Args:
-        result: from `fitting.fit`, or its JSON (`afm-jax fit --json`) as a mapping.
-        uncertainty: how far values may be off, relative, where the fit does not say.
+    Of several tables the first one's cantilever is designed with.
 
-    Raises:
-        TableError: if a value or the correlations are impossible.
-        ValueError: if the model or a parameter is none.
+    Args:
+        fit: from `fitting.fit`.
+        uncertainty: how far values may be off, relative, where the fit does not say.
     """
-    payload = as_json(result) if isinstance(result, FitResult) else result
-    settings = payload.get("settings") or {}
-    tables = payload["input"].get("tables") or [payload["input"]]
-    # of several tables the first one's cantilever is designed with
-    table, drive = tables[0], tables[0].get("drive") or "sample"
-    label = payload["tables"][0]["name"] if payload.get("tables") else ""
-    every = [*payload["parameters"]]
-    places = [i for i, name in enumerate(every) if name.partition(" of ")[2] in ("", label)]
-    found = {every[i].partition(" of ")[0]: payload["parameters"][every[i]] for i in places}
-    matrix = np.array(payload["correlations"]["matrix"], float)
-    if payload["model"] not in MODELS or matrix.shape != (len(every), len(every)):
-        raise ValueError("no model, or not a correlation for each pair of parameters")
-    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
-    driven = [one for one in tables if (one.get("drive") or "sample") == drive]
-    columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
-    law, valid = payload.get("law"), payload["valid"]
-    reasons = " ".join(payload.get("reasons") or ["no reason given."])
-    note = f"The fit that the design rests on is not valid: {reasons}"
+    table, label = fit.table.tables[0], fit.table.labels[0]
+    names = [*fit.parameters]
+    places = [i for i, name in enumerate(names) if name.partition(" of ")[2] in ("", label)]
+    found = {names[i].partition(" of ")[0]: fit.parameters[names[i]] for i in places}
+    values = {name: one.value for name, one in found.items()}
+    effects = tuple(fit.settings["effects"] or EFFECTS)
+    driven = [one for one in fit.table.tables if one.drive == table.drive]
+    drives = [(one.order, one.drive_frequency_khz, one.excitation_nm, one.offset_nm) for one in driven]
+    reasons = " ".join(fit.reasons)
     return Prior(
-        problem=problem,
-        values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, matrix[np.ix_(places, places)]),
-        free_frequency_khz=float(table["free_frequency_khz"]),
-        quality_factor=table.get("quality_factor"),
-        mass_ng=table.get("mass_ng"),
-        fixed=dict(settings.get("fixed") or {}),
+        problem=Problem(fit.model, tuple(found), effects, table.drive),
+        values=np.array([*values.values()]),
+        information=_information([*found.values()], fit.correlations[np.ix_(places, places)]),
+        free_frequency_khz=table.free_frequency_khz,
+        quality_factor=values.get("quality_factor", table.quality_factor),
+        mass_ng=table.mass_ng,
+        fixed=dict(fit.settings["fixed"]),
         uncertainty=uncertainty,
-        measured=np.array([[place for one in driven for place in one[name]] for name in columns], float).T,
-        source=f"fit of {table.get('source', 'a table')}",
-        notes=() if valid else (note,),
-        law=law_of_dict(law) if law and law.get("numbers") and valid else None,
+        measured=np.concatenate([np.stack(columns, axis=1) for columns in drives]).astype(float),
+        source=f"fit of {table.source}",
+        notes=() if fit.valid else (f"The fit that the design rests on is not valid: {reasons}",),
+        law=fit.law if fit.valid else None,
     )
 
 
-def _information(found: Mapping[str, Any], matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def _information(found: Sequence[FittedParameter], correlations: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
-    error = np.array([entry["standard_error"] for entry in found.values()], dtype=float)
-    sizes = np.abs(error[np.isfinite(error) & (error != 0.0)])
-    if np.any((sizes > FARTHEST) | (sizes < 1.0 / FARTHEST)):
-        raise ValueError("an error beyond what can be computed with")
-    known = np.isfinite(error) & np.isfinite(np.diag(matrix)) & (error > 0.0)
-    inner = matrix[np.ix_(known, known)]
-    if not np.all(np.isfinite(inner)) or (known.any() and np.linalg.eigvalsh(inner)[0] < 1e-14):
-        raise TableError("the saved fit's correlations contradict each other; fit the table again")
-    information = np.diag([float(e["constraint"][1]) ** -2.0 if e.get("constraint") else 0.0 for e in found.values()])
+    information = np.diag([one.constraint[1] ** -2.0 if one.constraint else 0.0 for one in found])
+    error = np.array([one.standard_error or np.nan for one in found])
+    known = np.isfinite(error * np.diag(correlations))
+    inner = np.ix_(known, known)
     # errors may be far apart in size: the correlations are inverted, which have none
-    information[np.ix_(known, known)] = np.linalg.inv(inner) / np.outer(error[known], error[known])
+    information[inner] = np.linalg.inv(correlations[inner]) / np.outer(error[known], error[known])
     return information

@@ -350,9 +350,12 @@ def _lines(evidence: Evidence, rows: Any) -> str:
 
 
 MISFITS: Rules[Evidence] = (
-    Rule(
-        lambda e: [e.chi2 / e.freedom] if e.p_value < IMPROBABLE else [],
-        "chi2/dof = {case:.3g} (probability {e.p_value:.1g})",
+    (
+        Rule(lambda e: not np.isfinite(e.chi2), "no orbits were found at the fitted law"),
+        Rule(
+            lambda e: [e.chi2 / e.freedom] if e.p_value < IMPROBABLE else [],
+            "chi2/dof = {case:.3g} (probability {e.p_value:.1g})",
+        ),
     ),
     Rule(_too_many_outliers, "{case}"),
     Rule(

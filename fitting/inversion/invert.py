@@ -191,19 +191,20 @@ def invert(
     impact, own, shared, chi2 = invert_rows(row, instrument, value, error)
     for found in (impact, own, shared):
         found[~chosen] = np.nan
-    rows = np.flatnonzero(np.isfinite(impact).all(axis=1))
+    there = np.all(np.isfinite(impact), axis=1)
     covariance = own @ np.swapaxes(own, 1, 2)
     shared = shared[:, :, [_INSTRUMENT.index(name) for name in stated]] * [error for _, error in stated.values()]
-    lines, fast = _lines(impact[rows], covariance[rows], shared[rows])
-    note = np.full(table.rows, "no phase with an amplitude: nothing to invert", dtype=object)
-    note[chosen] = "no flight between two impacts has this amplitude and phase"
-    note[rows] = np.where(fast, "", f"slower than {_SLOW} sqrt(epsilon): left out of the lines")
-    # four standard errors
-    for i in rows[chi2[rows] > 16.0]:
-        note[i] = f"amplitudes and phase contradict each other (chi2 {chi2[i]:.3g} of one degree of freedom)"
+    lines, in_lines = _lines(impact, covariance, shared, there)
+    # the first that holds
+    notes = {
+        "no phase with an amplitude: nothing to invert": ~chosen,
+        "no flight between two impacts has this amplitude and phase": ~there,
+        "amplitudes and phase contradict each other by more than four standard errors": chi2 > 16.0,
+        f"slower than {_SLOW} sqrt(epsilon): left out of the lines": ~in_lines,
+    }
     u, w, delay = impact.T
     unsure = table.quality_factor is not None and table.quality_factor_error is None
-    reason = _why_not_valid(u, lines, int(fast.sum()))
+    reason = _why_not_valid(u, lines, int(in_lines.sum()))
     return Inversion(
         approach_speed_nm_per_us=u,
         rebound_speed_nm_per_us=w,
@@ -211,8 +212,8 @@ def invert(
         covariance=covariance,
         shared=shared,
         shared_names=tuple(stated),
-        note=tuple(note),
-        in_lines=np.isin(np.arange(table.rows), rows[fast]),
+        note=tuple(np.select([*notes.values()], [*notes], "").tolist()),
+        in_lines=in_lines,
         lines=lines,
         table=table,
         reasons=() if reason is None else (reason,),
@@ -234,16 +235,16 @@ def _why_not_valid(speed: Rows, lines: dict[str, Line], rows: int) -> str | None
 
 
 def _lines(
-    impact: Impacts, covariance: Covariances, shared: Shared
+    impact: Impacts, covariance: Covariances, shared: Shared, there: Bool[np.ndarray, " rows"]
 ) -> tuple[dict[str, Line], Bool[np.ndarray, " rows"]]:
-    """Return the lines through the losses, and which rows they go through: those that are not too slow."""
-    fast, lines = np.ones(len(impact), dtype=bool), {}
+    """Return the lines through the losses, and which of the rows that are there they go through: not too slow ones."""
+    fast, lines = there, {}
     for _ in range(2):
         if fast.sum() < 3 or np.ptp(impact[fast, 0]) < 1e-6 * impact[fast, 0].max():
             return {}, fast
         lines = {law: line(impact[fast], covariance[fast], shared[fast], power) for law, power in POWERS.items()}
         epsilon = min(lines.values(), key=lambda one: one.chi2).epsilon
-        fast = impact[:, 0] > _SLOW * max(epsilon, 0.0) ** 0.5
+        fast = there & (impact[:, 0] > _SLOW * max(epsilon, 0.0) ** 0.5)
     return lines, fast
 
 
@@ -260,23 +261,17 @@ def line(impact: Impacts, covariance: Covariances, shared: Shared, power: int) -
         power: n.
     """
     u, w, _ = impact.T
-    scale = np.array([1.0, np.mean(u**power)])
-    design, wanted = np.stack([np.ones_like(u), u**power], axis=1) / scale, u**2 - w**2
-
-    def at(slope: float) -> Line:
-        slopes = np.stack([2.0 * u - power * slope * u ** (power - 1), -2.0 * w], axis=1)
+    design, wanted = np.stack([np.ones_like(u), u**power], axis=1), u**2 - w**2
+    whiten = inverse = np.zeros((2, 2))
+    found = np.zeros(2)
+    for _ in range(7):
+        slopes = np.stack([2.0 * u - power * found[1] * u ** (power - 1), -2.0 * w], axis=1)
         common = np.einsum("ni,nik->nk", slopes, shared[:, :2])
         own = np.einsum("ni,nij,nj->n", slopes, covariance[:, :2, :2], slopes)
-        # whitened by the root of the covariance of all residuals
+        # by the root of the covariance of all residuals
         whiten = np.linalg.inv(np.linalg.cholesky(np.diag(own) + common @ common.T))
         inverse = np.linalg.pinv(whiten @ design)
         found = inverse @ whiten @ wanted
-        chi2, freedom = float(np.sum((whiten @ (design @ found - wanted)) ** 2)), len(u) - 2
-        value, error = found / scale, np.sqrt(np.sum(inverse**2, axis=1)) / scale
-        (epsilon, slope), (epsilon_error, slope_error) = value.tolist(), error.tolist()
-        return Line(epsilon, epsilon_error, slope, slope_error, chi2, freedom, chi2_tail(chi2, freedom))
-
-    found = at(0.0)
-    for _ in range(6):
-        found = at(found.slope)
-    return found
+    chi2, freedom = float(np.sum((whiten @ (design @ found - wanted)) ** 2)), len(u) - 2
+    (epsilon, slope), (epsilon_error, slope_error) = found.tolist(), np.linalg.norm(inverse, axis=1).tolist()
+    return Line(epsilon, epsilon_error, slope, slope_error, chi2, freedom, chi2_tail(chi2, freedom))

@@ -32,6 +32,7 @@ def _(fit: FitResult) -> list[Section]:
     chi2 = f"chi2/dof = {fit.chi2:.1f}/{fit.degrees_of_freedom}{probability}"
     # where impacts last chi2 makes up for what a formula lacks
     chi2 += "" if has_delay(fit) else f", AIC {fit.aic:.1f}"
+    chi2 = chi2 if np.isfinite(fit.chi2) else "No orbits were found at the fitted law."
     title = f"Impact law of {fit.table.source} ({counted(fit.table.rows, 'row')}), model {fit.model}:"
     return [
         Section(title, [f"  {line}" for line in (*formulas(fit), held_in_words(fit)) if line]),

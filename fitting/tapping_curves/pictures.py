@@ -22,10 +22,6 @@ def curve_figure(result: Tapping) -> Figure:
     figure = new_figure(7.5, 0.5 + 3.0 * panels)
     top, *between, bottom = figure.subplots(panels, 1, sharex=True)
     _points(top, result, curve.amplitude_nm, curve.amplitude_error_nm)
-    if curve.drive == "force":
-        reach = np.linspace(curve.offset_nm.min(), min(curve.offset_nm.max(), 0.0), 2)
-        reach = np.maximum(reach, -curve.free_amplitude_nm.max())
-        top.plot(reach, -reach, ":", color=GRID, label="the tip just reaches the sample")
     label_axes(top, x="", y="amplitude (nm)")
     top.legend(fontsize=_SMALL, loc="lower left")
     if between:
@@ -33,11 +29,11 @@ def curve_figure(result: Tapping) -> Figure:
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
         label_axes(middle, x="", y="lag (degrees)")
         _points(bottom, result, rows.energy_aj, rows.energy_noise_aj)
-        drawn = _energy_bands(bottom, result)
+        # all points in contact are in the picture, those of the free tip not
         touching = rows.energy_aj[~rows.free & np.isfinite(rows.energy_aj)]
-        # all points in contact are in the picture
-        low, high = min([drawn[0], *touching.tolist()]), max([drawn[1], *touching.tolist()])
-        bottom.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+        ends = [0.0, *touching, *_energy_bands(bottom, result)]
+        margin = 0.05 * np.ptp(ends)
+        bottom.set_ylim(min(ends) - margin, max(ends) + margin)
     else:
         _points(bottom, result, rows.largest_energy_aj, np.zeros(curve.rows))
     label_axes(
@@ -69,21 +65,21 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
                 axes.errorbar(curve.offset_nm[here], values[here], errors[here], label=once, **style)
 
 
-def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
-    """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their range."""
-    ends = [0.0]
+def _energy_bands(axes: Axes, result: Tapping) -> list[float]:
+    """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their ends."""
+    ends = []
     for branch in result.branches:
         curve = branch.curve
         colour = ACCENT if branch.retract else BLUE
         axes.plot(curve.height_nm, curve.energy_aj, color=colour, lw=1.2)
         axes.fill_between(curve.height_nm, curve.energy_low_aj, curve.energy_high_aj, color=colour, alpha=0.15, lw=0)
-        ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
+        ends += [float(curve.energy_aj.max()), float(np.percentile(curve.energy_high_aj, 90.0))]
     for group in () if result.fit is None or result.why_not_constant else result.fit.groups:
         heights, energy = result.curve.offset_nm[group.rows], [group.energy_aj] * 2
         label = result.in_unit(f"one energy, {side_of(group.repulsive)}: {group.energy_aj:.3g} aJ")
         axes.plot([heights.min(), heights.max()], energy, "--", color=DARK, lw=1.0, label=label)
         ends += group.interval95_aj
-    return min(ends), max(ends)
+    return ends
 
 
 def together_figure(result: TappingTogether) -> Figure:

@@ -8,8 +8,8 @@ from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.report import Bullets, Picture, Section, Table, sections
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from afm_jax.words import interval, percent, with_error
+from fitting.tapping_curves.along import HEADLINE, differences_of_ways, interpolated, said_of
 from fitting.tapping_curves.branches import CurveBranch, Hysteresis
-from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, interpolated, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 

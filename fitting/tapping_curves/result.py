@@ -15,19 +15,19 @@ from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.branches import Hysteresis, way_of
-from fitting.tapping_curves.curve import Mask, Rows, TappingCurve
-from fitting.tapping_curves.energy import (
+from fitting.tapping_curves.along import (
     HEADLINE,
     MEASURED,
     EnergyFunctions,
-    Nuisance,
-    OneEnergy,
     TappingBranch,
     differences_of_ways,
     largest_of,
     said_of,
 )
+from fitting.tapping_curves.branches import Hysteresis, way_of
+from fitting.tapping_curves.curve import Mask, Rows, TappingCurve
+from fitting.tapping_curves.lever import Nuisance
+from fitting.tapping_curves.one_energy import OneEnergy
 from fitting.tapping_curves.speeds import MeasuredSpeeds
 from fitting.tapping_curves.verdict import (
     ASSUMPTIONS,

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ, effective_mass_ng
+from fitting.tapping_curves.along import EnergyFunctions
 from fitting.tapping_curves.curve import Given, Instrument, Mask, Rows, TappingCurve, motion_of
-from fitting.tapping_curves.energy import EnergyFunctions
 
 _STEPS = 1e-5 * np.eye(3)[:, :, None]
 """Of differences by the unknowns, in units of their own."""

@@ -14,6 +14,7 @@ from fitting.instruments.lag import PhaseReadings, sense_of_phase, turned
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
+from fitting.tapping_curves.along import energies_along
 from fitting.tapping_curves.branches import (
     FEWEST_ROWS,
     changes,
@@ -26,7 +27,6 @@ from fitting.tapping_curves.branches import (
 )
 from fitting.tapping_curves.curve import (
     Given,
-    Instrument,
     Mask,
     Rows,
     TappingCurve,
@@ -35,15 +35,10 @@ from fitting.tapping_curves.curve import (
     part_of,
     phase_readings,
 )
-from fitting.tapping_curves.energy import (
-    FEWEST_FREE_ROWS,
-    Lever,
-    energies_along,
-    largest_energies,
-    noise_of,
-    one_energy,
-)
+from fitting.tapping_curves.energy import largest_energies, noise_of
+from fitting.tapping_curves.lever import FEWEST_FREE_ROWS, Lever
 from fitting.tapping_curves.measured import CurveLike, measured
+from fitting.tapping_curves.one_energy import one_energy
 from fitting.tapping_curves.result import Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
@@ -318,20 +313,14 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
 
 
 def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> TappingCurve:
-    """Return a curve whose zero of the phase is that of its free rows, if the statements determine it no better.
+    """Return a curve without the zero of the phase that its free rows have at the frequency and Q given.
 
-    A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
-    given, and says so: taken for knowledge besides, it would count both twice.
+    A table that was read from an instrument's file states it, and says so: taken for knowledge besides, it would count
+    both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
-    if stated is None or free.sum() < FEWEST_FREE_ROWS:
-        return curve
-    frequency, quality = curve.free_frequency_khz, curve.quality_factor
-    start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
-    moved = [Instrument(sum(frequency), quality.value), Instrument(frequency.value, sum(quality))]
-    of_lag = np.linalg.norm([np.median(lag_of_free_tip(curve, at)[free] - start) for at in moved])
-    own = zero_of_free_rows(stated.error) in remarks or not stated.error < of_lag
-    return replace(curve, phase_zero_deg=None) if own else curve
+    read = stated is not None and free.sum() >= FEWEST_FREE_ROWS and zero_of_free_rows(stated.error) in remarks
+    return replace(curve, phase_zero_deg=None) if read else curve
 
 
 def _check_range(curve: TappingCurve, zero: float) -> None:

@@ -14,14 +14,9 @@ from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.tables.csv_text import TableError
+from fitting.tapping_curves.along import TappingBranch, energies_along
 from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
-from fitting.tapping_curves.energy import (
-    COMMON,
-    Lever,
-    Nuisance,
-    TappingBranch,
-    energies_along,
-)
+from fitting.tapping_curves.lever import COMMON, Lever, Nuisance
 from fitting.tapping_curves.measured import CurveLike, measured
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import energies_of_table

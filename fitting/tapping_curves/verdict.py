@@ -14,14 +14,11 @@ from afm_jax.solve.least_squares import IMPROBABLE, LARGEST_SCALE, TORN
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
+from fitting.tapping_curves.along import EnergyFunctions, what_narrows
 from fitting.tapping_curves.branches import FEWEST_ROWS, free_ends, ways
 from fitting.tapping_curves.curve import lag_of_free_tip
-from fitting.tapping_curves.energy import (
-    FEWEST_FREE_ROWS,
-    EnergyFunctions,
-    OneEnergy,
-    what_narrows,
-)
+from fitting.tapping_curves.lever import FEWEST_FREE_ROWS
+from fitting.tapping_curves.one_energy import OneEnergy
 
 _LARGEST_UNASKED_SCALE = 2.0
 """Scatter of rows in contact, of their errors, that is believed without `scale_errors`: measured curves have up to 1.8
