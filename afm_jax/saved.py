@@ -123,7 +123,7 @@ def load(path: str | Path) -> Any:
     except (ValueError, RecursionError) as error:
         refuse(f"is no JSON ({error})")
     if not isinstance(payload, dict) or not {"format", "type", "fields"} <= set(payload):
-        refuse("is no saved result; `.save(path)` of a result, or --out of its command, writes one")
+        refuse("is no saved result; `.save(path)` or `.report(folder)` of a result writes one")
     if payload["format"] == FORMAT and payload.get("format_version") != FORMAT_VERSION:
         refuse(
             f"has format_version {payload.get('format_version')}, but {FORMAT_VERSION} is known here: update afm-jax"
