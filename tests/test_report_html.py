@@ -107,6 +107,12 @@ def test_limits_read_plainly():
         assert interval_in_words(parameter, "nm").startswith(said)
 
 
+def test_a_fit_without_orbits_says_so_in_place_of_chi2():
+    text = str(made_fit("law", chi2=np.inf, valid=False, reasons=["no orbits"]))
+    assert "No orbits were found at the fitted law." in text
+    assert "inf" not in text
+
+
 def test_every_text_is_shown_as_it_is_and_does_nothing():
     hostile = '<script>alert("1")</script> & <img src=x onerror=y> \x0b\x7f'
     table = made_table(remarks=(hostile,), source="strange\udc80 <b>.csv")
