@@ -169,8 +169,8 @@ _EDITS = {
     "test_lockin.py::test_harmonics_of_a_motion_are_read_and_nothing_beside_them": {
         "blocks without the other order's periods": "both = {math.lcm(n, order) => n} * period"
     },
-    "test_inversion_law.py::test_values_without_noise_are_exact": {
-        "loss of a line as a sum": "/ scale, u**2 {- => +} w**2"
+    "test_inversion_law.py::test_laws_agree_with_a_fit_of_every_point[viscous]": {
+        "loss of a line as a sum": "u**power], axis=1), u**2 {- => +} w**2"
     },
     "test_inversion.py::test_one_amplitude_and_the_phase_suffice": {
         "inverted rebound with a gain for a loss": "np.sqrt(np.maximum(u**2 {+ => -} place[:, 3], 1e-4))"
@@ -181,7 +181,7 @@ _EDITS = {
     "test_thermal.py::test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved": {
         "thermal motion of half a line": "area = float({0.5 => 0.25} * np.pi"
     },
-    "test_thermal.py::test_saders_stiffness_is_what_nanosurf_states_in_the_file": {
+    "test_thermal.py::test_the_real_spectrum_meets_the_vendors_numbers": {
         "Sader's stiffness without a frequency": "np.imag(gamma) * omega{**2 => }"
     },
     "test_posterior.py::test_the_samplers_density_is_that_of_another_programs_amplitudes": {
