@@ -9,13 +9,13 @@ from fitting.calibration.calibrate import Calibration
 
 
 def calibration_figure(result: Calibration) -> Figure:
-    """Return the figure: amplitude (and phase) with the fit above, what is left below."""
+    """Return the figure: amplitude (and phase) with the fit, what is left below each."""
     (columns,) = csv_columns(result).values()
     kinds = ["amplitude", *(["phase_deg"] if "measured_phase_deg" in columns else [])]
-    figure = new_figure(1.0 + 5.5 * len(kinds), 5.5)
-    grid = figure.subplots(2, len(kinds), squeeze=False, sharex=True, height_ratios=(2.0, 1.0))
+    figure = new_figure(7.0, 5.0 * len(kinds))
+    grid = figure.subplots(2 * len(kinds), sharex=True, height_ratios=(2.0, 1.0) * len(kinds)).reshape(-1, 2)
     shift = 1e3 * (columns["frequency_khz"] - result.frequency_khz.value)
-    for (above, below), kind in zip(grid.T, kinds, strict=True):
+    for (above, below), kind in zip(grid, kinds, strict=True):
         measured, fitted = columns[f"measured_{kind}"], columns[f"fitted_{kind}"]
         left = fitted - measured
         if kind == "phase_deg":

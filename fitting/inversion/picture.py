@@ -8,9 +8,9 @@ from fitting.inversion.invert import POWERS, Inversion
 
 
 def inversion_figure(result: Inversion) -> Figure:
-    """Return the figure: left u_in^2 - u_out^2 with both lines, right the collision delay."""
-    figure = new_figure(10.0, 4.2)
-    losses, delays = figure.subplots(1, 2)
+    """Return the figure: u_in^2 - u_out^2 with both lines above, the collision delay below."""
+    figure = new_figure(7.0, 8.0)
+    losses, delays = figure.subplots(2)
     u, w = result.approach_speed_nm_per_us, result.rebound_speed_nm_per_us
     slopes = np.stack([2.0 * u, -2.0 * w], axis=1)
     error = np.sqrt(np.einsum("ni,nij,nj->n", slopes, result.covariance[:, :2, :2], slopes))
