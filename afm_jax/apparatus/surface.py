@@ -32,19 +32,14 @@ class Surface(MovingSurface):
     Args:
         offset_nm: mean height at time 0.
         offset_rate_nm_per_us: slow ramp of the offset.
-        tones: the waves.
+        waves: in any number.
     """
 
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
     offset_rate_nm_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    tones: tuple[Wave, ...]
+    waves: tuple[Wave, ...]
 
     __repr__ = readable
-
-    @property
-    def waves(self) -> tuple[Wave, ...]:
-        """The waves."""
-        return self.tones
 
 
 def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
@@ -126,13 +121,13 @@ def free_frame(scene: Scene) -> FreeFrame:
     for amplitude, own in tones:
         periodic = periodic & ((amplitude == 0.0) | (jnp.abs(own - frequency) <= SAME_FREQUENCY * frequency))
     omega = RAD_PER_US_PER_KHZ * frequency
-    motion = _summed(surface.tones, omega)
+    motion = _summed(surface.waves, omega)
     phase = _angle(motion.cosine, motion.sine)
     drive = excitations[0]
     return FreeFrame(
         platform=Platform(motion.amplitude_nm, frequency, surface.offset_nm, surface.offset_rate_nm_per_us),
         phase_rad=phase,
-        response=_later(_summed(response.tones, omega), phase),
+        response=_later(_summed(response.waves, omega), phase),
         base=None if scene.base is None else _later(scene.base.tones[0].wave, phase),
         drive_phase_rad=drive.tones[0].phase_rad + phase,
         periodic=periodic,

@@ -243,9 +243,7 @@ def last_fifth(first_us: float, last_us: float, drive: DrivePeriod, periods: int
         periods: N, drive periods in a response period.
     """
     span, response = last_us - first_us, periods * drive.period_us
-    whole = int(_LAST_FRACTION * span / response)
-    if whole == 0:
-        whole = int(span >= response)
+    whole = int(_LAST_FRACTION * span / response) or int(span >= response)
     return Window(last_us - (whole * response if whole else _LAST_FRACTION * span), last_us, periods, whole)
 
 
