@@ -377,6 +377,11 @@ class TabulatedImpact(Impact):
     in asinh(v/scale), which is v itself at capture and its logarithm far from it. The delay is the time in contact less
     what the straight paths take, outer/u_out + inner/u_in, and so as singular at capture as it is.
 
+    It stands beside `LawTable` because a contact is followed back from rebound speeds, while knots of that table are
+    approach speeds over a capture speed that is known only then: the series takes 32 collisions to any speed. The fit's
+    spline through it is off by up to 9e-7 of the rebound speed and 1.4e-4 us of the delay, 1e-7 and 1e-6 us are
+    promised here; 168 knots beside the whole lead outer (1/u_out - 1/u_in) would do, but have their values from here.
+
     Attributes:
         loss: coefficients of the loss in nm^2/us^2, shape (terms,).
         time: coefficients of the time in contact in us, shape (terms,).
