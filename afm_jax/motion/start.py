@@ -1,12 +1,15 @@
 """Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import free_frame, surface_of
+from afm_jax.apparatus.surface import Surface, free_frame, surface_of
 from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
@@ -54,8 +57,7 @@ def default_start(scene: Scene) -> State:
     on_orbit = _on_orbit(scene, still, law) if periodic and law is not None else None
     if on_orbit is not None:
         return on_orbit
-    sample_alone = scene.base is None and scene.force is None
-    if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * float(gap_of_departure(scene)) + 1.0:
+    if (scene.base or scene.force) and -scene.platform.position(0.0) > 2.0 * gap_of_departure(scene) + 1.0:
         return state(0.0, 0.0, 0.0)
     return _leaving(scene)
 
@@ -106,26 +108,29 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     slot = int(np.argmax(np.where(wanted, np.asarray(orbits.approach_speed_nm_per_us), -np.inf)))
     time = float(orbits.phase_rad[slot]) / omega
     velocity = float(orbits.velocity_after_nm_per_us[slot])
+    height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
     if not isinstance(scene.interaction, Contact):
-        height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
         return state(time, height, velocity if stable.any() else velocity + _PUSH * (velocity - speed))
-    return _risen(scene, time, velocity, float(gap_of_departure(scene)))
+    begin = state(time, height, velocity)
+    risen, rises = _risen(scene.cantilever, *surface_of(scene), begin, gap_of_departure(scene))
+    return risen if rises else None
 
 
-def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
-    """Return where a flight that leaves the platform first has a gap; None if it does not rise that far."""
-    surface, response = surface_of(scene)
-    begin = state(time, float(scene.platform.position(time)), velocity)
+@jax.jit
+def _risen(
+    cantilever: Cantilever, surface: Platform | Surface, response: Surface | None, begin: State, gap: Float[Array, ""]
+) -> tuple[State, Bool[Array, ""]]:
+    """Return where a flight that leaves the platform first has a gap, and whether it rises that far."""
     leaving = to_gap(surface, response, begin)
 
     def missing(end: Array) -> tuple[Array, Array]:
-        reached, rate = fly(scene.cantilever, surface, *leaving, begin.time_us, end)
+        reached, rate = fly(cantilever, surface, *leaving, begin.time_us, end)
         return reached - gap, rate
 
     end = newton_steps(missing, begin.time_us + gap / leaving[1], _NEWTON_STEPS)
     short, rate = missing(end)
     rises = (end >= begin.time_us) & (rate > 0.0) & (jnp.abs(short) < _CLOSE * (1.0 + gap))
-    return to_lab(surface, response, end, gap, rate) if rises else None
+    return to_lab(surface, response, end, gap, rate), rises
 
 
 def _leaving(scene: Scene) -> State:

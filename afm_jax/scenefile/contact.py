@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.checks import check_parameter, is_traced
+from afm_jax.checks import check_parameter
 from afm_jax.contact.contact import FORCES, Contact, check_effects
 from afm_jax.contact.junction import find_junction, require_junction
 from afm_jax.contact.parameters import CONTACT_RANGES
@@ -29,8 +29,7 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
     contact = Contact.of(tuple(effects), **parameters)
-    if not any(map(is_traced, parameters.values())):
-        require_junction(contact, find_junction(contact).exists)
+    require_junction(contact, find_junction(contact).exists)
     return contact
 
 

@@ -77,7 +77,8 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
     if table == "interaction" and others:
         return f'unknown key of model = "{model}"; it belongs to model = "{others[0]}"'
-    return f"unknown key; use {nearest_name(plain, keys) or 'one of ' + ', '.join(keys)}"
+    nearest = next((name for name in keys if name.startswith(f"{plain}_")), None) or nearest_name(plain, keys)
+    return f"unknown key; use {nearest or 'one of ' + ', '.join(keys)}"
 
 
 def advise_table(name: str, *, is_table: bool) -> str:
