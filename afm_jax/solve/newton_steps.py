@@ -17,6 +17,11 @@ def newton_steps(
 ) -> Float[Array, "..."]:
     """Return the root of f that so many steps x - f/f' lead to, or of each of several equations.
 
+    >>> import jax
+    >>> with jax.enable_x64(True):
+    ...     print(round(newton_steps(lambda x: (x * x - 2.0, 2.0 * x), jnp.ones(()), 6).item(), 12))
+    1.414213562373
+
     Args:
         value_and_slope: f and its derivative at x, of x's shape; where the derivative is 0 no step is made.
         guess: near the root.
