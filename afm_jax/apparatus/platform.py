@@ -1,5 +1,6 @@
 """The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one."""
 
+from abc import abstractmethod
 from collections.abc import Iterable
 from functools import reduce
 from typing import NamedTuple
@@ -28,7 +29,11 @@ class MovingSurface(eqx.Module):
 
     offset_nm: eqx.AbstractVar[Float[Array, "..."]]
     offset_rate_nm_per_us: eqx.AbstractVar[Float[Array, "..."]]
-    waves: eqx.AbstractVar[tuple[Wave, ...]]
+
+    @property
+    @abstractmethod
+    def waves(self) -> tuple[Wave, ...]:
+        """What the motion is the sum of."""
 
     @property
     def reach_nm(self) -> Float[Array, "..."]:
