@@ -135,7 +135,7 @@ def turning_root(solid: ElasticCurve, level: Float[Array, "..."]) -> Float[Array
         slope = fixed_curve.load(root) * fixed_curve.depth_slope(root)
         return fixed_curve.work(root) - fixed, jnp.maximum(slope, 0.0)
 
-    return implicit_root(_excess_work, newton_steps(excess_and_slope, fixed_curve.beyond(fixed), 9), (solid, level))
+    return implicit_root(_excess_work, newton_steps(excess_and_slope, fixed_curve.beyond(fixed), 8), (solid, level))
 
 
 def _excess_work(root: Float[Array, "..."], of: tuple[ElasticCurve, Float[Array, "..."]]) -> Float[Array, "..."]:
