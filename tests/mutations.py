@@ -25,7 +25,7 @@ _EDITS = {
         "damped velocity leans the wrong way": "decay * (cosine {- => +} lag)",
         "damped frequency with 1/2Q^2": "1.0 - {0.25 => 0.5} / self",
     },
-    "test_apparatus.py::test_platform_velocity_and_acceleration_are_derivatives": {
+    "test_surface.py::test_velocity_and_acceleration_are_derivatives": {
         "platform velocity turned round": "self.sine * omega * cosine {- => +} self.cosine",
         "platform acceleration without an omega": "acceleration - {square => wave.angular_frequency} * height",
     },
@@ -37,7 +37,7 @@ _EDITS = {
         "lead of the delay as a sum": "self.lead_nm * (1.0 / w {- => +} 1.0 / u) - self.offset_nm / u\n",
         "capture speed with half its adhesion": "{4.0 => 2.0} * self.r**2 * square",
     },
-    "test_first_impact.py::test_no_grazing_impact_missed_in_a_few_hundred_flights": {
+    "test_first_impact.py::test_no_first_impact_missed_against_brute_force": {
         "bound of the gap without the platform": "gap_bound=tip_bound{ + platform.largest_acceleration_nm_per_us2 => }",
         "safe step that is too long": "rate * rate + {2.0 => 0.5} * bound",
         "platform that reaches less high": "rate * start {+ => -} platform.reach_nm",
@@ -54,7 +54,7 @@ _EDITS = {
         "impact's Jacobian with the delay turned round": "1.0 {+ => -} delay_slope * acceleration_in",
         "implicit derivative turned round": "{- => }shift / ",
     },
-    "test_jacobian.py::test_equation_7_without_adhesion_is_that_of_equation_1": {
+    "test_verification.py::test_every_equation_is_compared_at_ten_thousand_states_and_passes": {
         "eq. 7 with a plus": "flight.c2 * (ratio {- => +} 1.0)"
     },
     "test_orbits.py::test_orbits_are_those_of_the_reference[damped]": {
@@ -70,10 +70,8 @@ _EDITS = {
     "test_polynomial_roots.py::test_a_close_pair_is_told_apart": {
         "bracket that keeps the wrong half": "(value > 0.0) {== => !=} rising"
     },
-    "test_lasting_impact.py::test_air_takes_what_an_integrated_damped_contact_loses": {
-        "air that drives a contact": "deep * change {- => +} air"
-    },
     "test_lasting_impact.py::test_depth_and_loss_by_the_air_are_those_of_the_course_through_bridge_and_solid": {
+        "air that drives a contact": "deep * change {- => +} air",
         "straight paths through a bridge": "lasts * tau + flown{ + drawn => }",
         "air counted twice between solid and gap 0": "raised * {(u + w) => (w - u)}",
     },
@@ -118,7 +116,7 @@ _EDITS = {
     "test_forces.py::test_viscous_force_of_water_is_the_number_of_the_unit_page": {
         "viscous force with half its drag": "{1.5 => 0.75} * jnp.pi * self"
     },
-    "test_junction.py::test_numbers_of_the_paper_to_five_digits": {
+    "test_junction.py::test_other_parameters_agree_with_mpmath": {
         "JKR work without its last term": "(0.4 * cube - SLOPE){ + 1.0 => })",
         "junction at the JKR stiffness of half the load": "(6.0 * cube - {3.0 => 1.5} * math",
     },

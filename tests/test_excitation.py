@@ -80,7 +80,7 @@ def test_the_gap_is_that_of_a_free_cantilever_over_the_surface():
     assert response is not None
     steady = both(response)
     assert isinstance(surface, Surface)
-    waves = [tuple(float(x) for x in (w.cosine, w.sine, w.angular_frequency)) for w in surface.tones]
+    waves = [tuple(float(x) for x in (w.cosine, w.sine, w.angular_frequency)) for w in surface.waves]
 
     def over(t):
         return -1 + 1e-2 * t + sum(c * np.cos(w * t) + s * np.sin(w * t) for c, s, w in waves)

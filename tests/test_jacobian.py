@@ -5,12 +5,8 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
+from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.map import next_impact
 from tests import reference_map
 from tests.package_scenes import scene_of
@@ -56,14 +52,3 @@ def test_second_derivatives_of_the_impact_time_have_nine_digits():
         hessian = np.array(second(jnp.array([time, velocity])))
         np.testing.assert_allclose(hessian[[0, 0, 1], [0, 1, 1]], exact, rtol=1e-9)
         np.testing.assert_allclose(hessian[0, 1], hessian[1, 0], rtol=1e-10)
-
-
-@settings(deadline=None, max_examples=20)
-@given(r=st.floats(0.3, 1.0), phase=st.floats(0.0, 6.0), velocity=st.floats(-100.0, -30.0))
-def test_equation_7_without_adhesion_is_that_of_equation_1(r, phase, velocity):
-    platform = Platform(amplitude_nm=2.0, frequency_khz=180.0)
-    end = phase / float(platform.angular_frequency)
-    matrix = np.array(eq7(paper_flight(Cantilever(90.0), platform, 0.0, 1.0, end), velocity, r, 0.0))
-    turn = -(1.0 + r) * 2.0 * float(platform.angular_frequency) ** 2 * np.cos(phase)
-    # V' = -r V + (1 + r) v_p: a few roundings.
-    np.testing.assert_allclose(matrix, [[1.0, 0.0], [turn, -r]], rtol=1e-13, atol=1e-14)

@@ -21,20 +21,11 @@ FIELDS = {
 }
 
 
-def test_numbers_of_the_paper_to_five_digits():
+def test_hysteresis_of_bridge_and_junction_are_the_numbers_of_the_paper():
     found = solve(Contact.paper())
-    assert bool(found.exists)
-    for name, value, half_a_digit in (
-        ("forms_gap_nm", 0.12360, 5e-6),
-        ("shift_nm", 0.31603, 5e-6),
-        ("breaks_gap_nm", 0.50420, 5e-6),
-        ("hysteresis_aj", 55.75, 5e-3),
-        ("bridge_hysteresis_aj", 30.25, 5e-3),
-        ("junction_hysteresis_aj", 25.50, 5e-3),
-        ("force_nn", -25.5, 0.05),
-        ("stiffness_nn_per_nm", 692, 0.5),
-    ):
-        assert float(getattr(found, name)) == pytest.approx(value, abs=half_a_digit), name
+    # half of the last digit printed
+    assert float(found.bridge_hysteresis_aj) == pytest.approx(30.25, abs=5e-3)
+    assert float(found.junction_hysteresis_aj) == pytest.approx(25.50, abs=5e-3)
 
 
 @pytest.mark.parametrize(

@@ -155,21 +155,6 @@ def test_a_delay_with_an_offset_is_that_of_a_raised_surface(pull):
     assert depth == pytest.approx(flown - np.trapezoid(end.sol(times)[0], times), rel=1e-5)
 
 
-def test_air_takes_what_an_integrated_damped_contact_loses():
-    quality_factor = 200.0
-    cantilever = afm.Cantilever(90.0, quality_factor)
-    decay = float(cantilever.decay_rate)
-    tau = 0.1
-    stiff = (HERTZ_TIME / tau) ** 2.5  # d'' = -stiff d^(3/2) at speed 1 lasts tau
-
-    def motion(_, state):
-        return [state[1], stiff * np.maximum(-state[0], 0.0) ** 1.5 - 2.0 * decay * state[1]]
-
-    found = corrected(lasting(tau), around(0.0), cantilever, impact_of(tau, 0.0))
-    lost = 1.0 - left(motion)[0] ** 2
-    assert 1.0 - float(found.rebound) ** 2 == pytest.approx(lost, rel=1e-2)  # second order: lost is 6e-4
-
-
 @pytest.mark.parametrize(
     "numbers", [{}, {"relative_humidity": 0.637, "adhesion_energy_j_per_m2": 0.19, "modulus_gpa": 32.9}]
 )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.impact.map import iterate_map, next_impact
+from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing, scene_of, stacked
 from tests.reference_examples import DELAY, scene
@@ -113,29 +113,3 @@ def test_derivatives_stay_finite_in_every_lane(delayed):
         assert np.all(np.isfinite(leaf[:4]))
     assert np.all(np.asarray(by_start[0]) != 0.0)
     np.testing.assert_array_equal(by_start[1:4], 0.0)
-
-
-@pytest.mark.slow
-def test_second_derivatives_through_a_sequence_are_right():
-    # Reverse mode through a scan treats rules of differentiation in its own way: once a source of wrong Hessians.
-    p = scene()
-    made = scene_of(p)
-    rows = iterate_map(made, *START, 2)
-    guesses = [float(time) for time in rows.arrival_time_us]
-
-    def exact(time, velocity):
-        for guess in guesses:
-            impact = exact_impact(p, time, velocity, guess)
-            time, velocity = impact.time_us, impact.velocity_after_nm_per_us
-        return time
-
-    with mp.workdps(60):
-        at = (mp.mpf(START[0]), mp.mpf(START[1]))
-        expected = [float(mp.diff(exact, at, orders)) for orders in ((2, 0), (1, 1), (0, 2))]
-
-    def automatic(start):
-        return iterate_map(made, start[0], start[1], 2).time_us[-1]
-
-    hessian = np.asarray(jax.jit(jax.jacfwd(jax.jacrev(automatic)))(jnp.array(START)))
-    # Second derivatives add up terms up to 1e3 times as large.
-    np.testing.assert_allclose(hessian[[0, 0, 1], [0, 1, 1]], expected, rtol=1e-9)

@@ -96,18 +96,6 @@ def test_orbits_are_those_of_the_reference(name):
             assert inside or float(impact.time_us) < start + period - 1e-3
 
 
-@pytest.mark.parametrize(
-    ("reduced", "amplitude", "offset", "height"),
-    [(1.0001, 2.0, 0.0, 166), (1.01, 4.0, -2.0, 108), (1.01, 4.0, 0.0, 208), (1.01, 4.0, 2.0, 291)],
-)
-def test_peak_heights_of_the_known_orbits(reduced, amplitude, offset, height):
-    # Those with a delay: tests/test_one_answer.py.
-    found = single_impact_orbits(scene_of(scene(reduced, amplitude_nm=amplitude, offset_nm=offset)), 1)
-    (peak,) = np.asarray(found.peak_amplitude_nm)[np.asarray(found.stable & found.admissible)]
-    # Printed without decimals.
-    assert peak == pytest.approx(height, rel=0.005)
-
-
 @pytest.mark.parametrize("quality_factor", [None, 1e12])
 def test_resonance_is_closed_form(quality_factor):
     made = Scene(Cantilever(90.0, quality_factor), Platform(2.0, 180.0), ImpactLaw(r=0.8))

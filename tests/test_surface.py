@@ -33,8 +33,7 @@ def test_bounds_hold_and_are_sharp_for_one_wave():
         bend = np.max(np.abs(np.asarray(motion.acceleration(jnp.asarray(time)))))
         assert reach <= float(motion.reach_nm)
         assert bend <= float(motion.largest_acceleration_nm_per_us2)
-        if isinstance(motion, Surface):
-            assert np.max(np.abs(velocity - ramp)) <= float(motion.top_speed_nm_per_us) * (1 + 1e-12)  # rounding
+        assert np.max(np.abs(velocity - ramp)) <= float(motion.top_speed_nm_per_us) * (1 + 1e-12)  # rounding
     # sqrt(0.3^2 + 1.1^2), and its products with 0.6
     bounds = [one.reach_nm, one.top_speed_nm_per_us, one.largest_acceleration_nm_per_us2]
     np.testing.assert_allclose(bounds, np.sqrt(1.3) * np.array([1.0, 0.6, 0.36]), rtol=1e-14)

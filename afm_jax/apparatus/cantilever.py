@@ -51,8 +51,7 @@ def mass_of(frequency_khz: Any, mass_ng: Any, spring_constant_n_per_m: Any) -> A
     numbers = mass_ng, spring_constant_n_per_m, frequency_khz
     if not any(map(is_traced, numbers)):
         for one in np.broadcast(*map(np.asarray, numbers)):
-            wrong = contradicting_mass(*map(float, one))
-            if wrong:
+            if wrong := contradicting_mass(*map(float, one)):
                 raise ValueError(wrong)
     return mass_ng
 

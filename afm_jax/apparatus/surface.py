@@ -75,8 +75,8 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
             moving = (tone for tone in drive.tones if not _is_known_zero(tone.amplitude))
             response += [_response(cantilever, tone.wave, push) for tone in moving]
     motion = [wave for wave in platform.waves if not (_is_known_zero(wave.cosine) and _is_known_zero(wave.sine))]
-    against = [-wave for wave in response]
-    surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, (*motion, *against))
+    waves = (*motion, *(-wave for wave in response))
+    surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, waves)
     still = jnp.zeros_like(platform.offset_nm)
     return surface, Surface(still, still, tuple(response))
 
@@ -126,15 +126,14 @@ def free_frame(scene: Scene) -> FreeFrame:
     for amplitude, own in tones:
         periodic = periodic & ((amplitude == 0.0) | (jnp.abs(own - frequency) <= SAME_FREQUENCY * frequency))
     omega = RAD_PER_US_PER_KHZ * frequency
-    motion = _summed(surface.tones, omega)
+    motion = _summed(surface.waves, omega)
     phase = _angle(motion.cosine, motion.sine)
-    drive = excitations[0]
     return FreeFrame(
         platform=Platform(motion.amplitude_nm, frequency, surface.offset_nm, surface.offset_rate_nm_per_us),
         phase_rad=phase,
-        response=_later(_summed(response.tones, omega), phase),
+        response=_later(_summed(response.waves, omega), phase),
         base=None if scene.base is None else _later(scene.base.tones[0].wave, phase),
-        drive_phase_rad=drive.tones[0].phase_rad + phase,
+        drive_phase_rad=excitations[0].tones[0].phase_rad + phase,
         periodic=periodic,
     )
 

@@ -44,8 +44,8 @@ def sine_cosine(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[
     for part in _HALF_PI_PARTS:
         rest = rest - quadrant * part
     square = rest * rest
-    sine = rest + rest * square * _horner(_SINE, square)
-    cosine = 1.0 - 0.5 * square + square * square * _horner(_COSINE, square)
+    sine = rest + rest * square * horner(_SINE, square)
+    cosine = 1.0 - 0.5 * square + square * square * horner(_COSINE, square)
     # The quadrant modulo 4 in floating point: no integer overflow however large the angle is.
     turn = quadrant - 4.0 * jnp.floor(0.25 * quadrant)
     swapped = (turn == 1.0) | (turn == 3.0)
@@ -61,7 +61,8 @@ def _sine_cosine_jvp(primals, tangents):
     return (sine, cosine), (cosine * rate, -sine * rate)
 
 
-def _horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+def horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return a polynomial's value at x, its coefficients given highest power first."""
     value = jnp.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         value = value * x + coefficient

@@ -41,6 +41,8 @@ _SLOWEST = 0.01
 """Fraction of K at the start below which no iteration lets it fall: a slower driven tip is followed in time."""
 _REMEMBERED = 20
 """Steps up to which reverse mode keeps what it needs of each; of more it computes them again."""
+_WRITTEN_OUT = 3
+"""Iterations up to which a loop of them is written out in the program."""
 _SCAN = 256
 """Gaps at which a turning point is looked for."""
 
@@ -256,13 +258,8 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
         guess = guess - way.tip.mass_ng * drive.push.position(way.begin_us) * (at.gap_nm - start_nm)
     state, count = (guess, guess, guess), 0 if way.quiet else iterations
-    # few are written out in the program, more are a loop
-    if count > 3:
-        state = lax.fori_loop(0, count, again, state)
-    else:
-        for number in range(count):
-            state = again(number, state)
-    spent, before, spending = state
+    # few are written out in the program
+    spent, before, spending = lax.fori_loop(0, count, again, state, unroll=count <= _WRITTEN_OUT)
     kinetic = at.available_aj - spent
     speed, time_slope = way.speed_and_time_slope(at.path_nm, kinetic)
     lost = at.drag * speed

@@ -28,6 +28,7 @@ from afm_jax.contact.forces.dry import Hertz
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.newton_steps import newton_steps
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
@@ -162,11 +163,10 @@ def _tangency(model: Tangent, forms_nm: Float[Array, ""]) -> tuple[Array, Array]
     (low, high), found = lax.scan(lambda ends, _: _scan(model, *ends), ends, length=2)
     found = found[-1]
 
-    def newton(_, point):
-        excess, slope = jax.jvp(lambda at: _excess_stiffness(at, model), (point,), (jnp.ones_like(point),))
-        return jnp.clip(point - excess / jnp.where(slope == 0.0, 1.0, slope), low, high)
+    def excess_and_slope(point):
+        return jax.jvp(lambda at: _excess_stiffness(at, model), (point,), (jnp.ones_like(point),))
 
-    root = lax.fori_loop(0, 4, newton, 0.5 * (low + high))
+    root = newton_steps(excess_and_slope, 0.5 * (low + high), 4, low, high)
     return jnp.where(found, root, jnp.zeros_like(root)), found
 
 

@@ -23,6 +23,8 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.settings import QuickSetting
+from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.newton_steps import newton_steps
 from afm_jax.solve.quadrature import mean_matrix, nodes_along
 
 
@@ -87,7 +89,7 @@ def stretch_in_junction(
     s = turn - (turn - end) * fraction
     missing = level - tip.solid.work(s)
     moving = missing > 0.0
-    speed = _speed_scale(tip) * jnp.sqrt(jnp.where(moving, missing, 1.0))
+    speed = jnp.sqrt(_unit(tip)) * jnp.sqrt(jnp.where(moving, missing, 1.0))
     path = tip.solid.depth_scale_nm * (turn - end) * bend * tip.solid.depth_slope(s)
     time_slope = jnp.where(moving, path / speed, 0.0)
     return Stretch(cumulative @ time_slope, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ time_slope)
@@ -125,28 +127,25 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
 def turning_root(solid: ElasticCurve, level: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the largest s at which the normalised work is `level`, by Newton's method from above.
 
-    The work is convex to the right of its minimum, so that Newton's steps from above never pass the root. The last two
-    carry the derivatives (two: first and second are right).
+    The work is convex to the right of its minimum, so that Newton's steps from above never pass the root.
     """
     fixed_curve, fixed = lax.stop_gradient((solid, level))
-    far = fixed_curve.beyond(fixed)
-    root = lax.fori_loop(0, 7, lambda _, root: _newton(fixed_curve, root, fixed), far)
-    return _newton(solid, _newton(solid, lax.stop_gradient(root), level), level)
+
+    def excess_and_slope(root):
+        slope = fixed_curve.load(root) * fixed_curve.depth_slope(root)
+        return fixed_curve.work(root) - fixed, jnp.maximum(slope, 0.0)
+
+    return implicit_root(_excess_work, newton_steps(excess_and_slope, fixed_curve.beyond(fixed), 8), (solid, level))
 
 
-def _newton(solid: ElasticCurve, root: Float[Array, "..."], level: Float[Array, "..."]) -> Float[Array, "..."]:
-    slope = solid.load(root) * solid.depth_slope(root)
-    uphill = slope > 0.0
-    return root - jnp.where(uphill, (solid.work(root) - level) / jnp.where(uphill, slope, 1.0), 0.0)
+def _excess_work(root: Float[Array, "..."], of: tuple[ElasticCurve, Float[Array, "..."]]) -> Float[Array, "..."]:
+    solid, level = of
+    return solid.work(root) - level
 
 
 def _unit(driven: Driven) -> Array:
     """Return twice the unit of the junction's energy over the mass: w^2 is that times the normalised energy."""
     return 2.0 * driven.solid.energy_scale_aj * driven.inverse_mass
-
-
-def _speed_scale(driven: Driven) -> Array:
-    return jnp.sqrt(_unit(driven))
 
 
 class _Along(NamedTuple):
@@ -250,5 +249,5 @@ def _time_to_fold(tip: Driven, start: Float[Array, "..."], leaving: Float[Array,
     moving = kinetic > 0.0
     rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
     time_slope = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
-    scale = tip.solid.depth_scale_nm / _speed_scale(tip)
+    scale = tip.solid.depth_scale_nm / jnp.sqrt(_unit(tip))
     return jnp.tensordot(weights, reach * time_slope * scale, axes=1)

@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.contact.driven import ContactState, Driven
 from afm_jax.contact.junction import ContactPhase
 from afm_jax.solve.derivatives import slope_of
+from afm_jax.solve.newton_steps import newton_steps
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""
@@ -367,14 +368,12 @@ class _Cubic(NamedTuple):
     def crossing(self) -> Float[Array, "..."]:
         """Return the fraction of the step at which f vanishes, where its ends have different signs."""
 
-        # a few steps of Newton's method: a miss is only tried again
-        def improve(_, fraction):
-            slope = self.slope + fraction * (2.0 * self.bend + 3.0 * fraction * self.twist)
-            correction = self.value(fraction) / jnp.where(slope == 0.0, 1.0, slope)
-            return jnp.clip(fraction - correction, 0.0, 1.0)
+        def value_and_slope(fraction):
+            return self.value(fraction), self.slope + fraction * (2.0 * self.bend + 3.0 * fraction * self.twist)
 
         secant = self.start / jnp.where(self.start == self.end, 1.0, self.start - self.end)
-        return lax.fori_loop(0, 4, improve, secant)
+        # few: a miss is only tried again
+        return newton_steps(value_and_slope, secant, 4, 0.0, 1.0)
 
     def turning_point(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return fraction and value of the extremum, where the slopes at the ends have different signs."""

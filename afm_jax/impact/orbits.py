@@ -39,6 +39,7 @@ from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
 from afm_jax.solve.lanes import compiled_quickly
+from afm_jax.solve.newton_steps import newton_steps
 from afm_jax.units import within_turn
 
 _ARRIVAL_TOLERANCE = 1e-7
@@ -457,17 +458,15 @@ def highest_of_flight(
         bend = cantilever.acceleration(position, velocity) + motion.acceleration(flight.start_us + after)
         return position + height, velocity + rate, bend
 
+    def rate_and_bend(after):
+        _, rate, bend = at(after)
+        return rate, jnp.minimum(bend, 0.0)
+
     step = flight.duration_us / samples
     times = step * jnp.arange(samples + 1.0)
-    seen, _, _ = at(times)
-
-    def improve(_, after):
-        _, rate, bend = at(after)
-        move = jnp.where(bend < 0.0, -rate / jnp.where(bend < 0.0, bend, 1.0), 0.0)
-        return jnp.clip(after + jnp.clip(move, -step, step), 0.0, flight.duration_us)
-
+    best = times[jnp.argmax(at(times)[0])]
+    top = newton_steps(rate_and_bend, best, 5, jnp.maximum(best - step, 0.0), jnp.minimum(best + step, times[-1]))
     # its own change counts nothing, because the height is largest there
-    top = lax.fori_loop(0, 5, improve, times[jnp.argmax(seen)])
     return at(lax.stop_gradient(top))[0]
 
 

@@ -281,15 +281,12 @@ def _at_height(
         moving = _with_sample(scene, begin.height_nm - rate * float(start.time_us), rate)
         on_the_way = follow_long(moving, start, periods * period_us, accuracy=accuracy)
         reading = _why_over(on_the_way)
-        if reading is None:
-            end_us = float(on_the_way.simulation.final.time_us)
-            dense = DensePath(moving, on_the_way.simulation)
-            start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
-            if start is None:
-                return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
-        elif reading.outcome == CurveOutcome.CAPTURED or not clear:
+        if reading is not None:
             return reading, None
-        # a way that broke off is left out: the tip begins at the height at once
+        end_us = float(on_the_way.simulation.final.time_us)
+        start = _top_of_swing(DensePath(moving, on_the_way.simulation), end_us - period_us, end_us, period_us)
+        if start is None:
+            return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
 
     def over(motion: Simulation) -> bool:
         if is_stuck(here, motion):

@@ -254,8 +254,8 @@ def _fly(
 
 def at_junction(driven: Driven, tip: TipInContact) -> Bool[Array, "..."]:
     """Return whether a tip has just formed the junction, so that legs may go on from there."""
-    at_its_begin = (tip.state.x == driven.junction.forms_root) & (tip.trial_length == 0.0)
-    return (tip.phase == ContactPhase.JUNCTION) & at_its_begin
+    formed = (tip.phase == ContactPhase.JUNCTION) & (tip.state.x == driven.junction.forms_root)
+    return formed & (tip.trial_length == 0.0)
 
 
 def _through_legs(

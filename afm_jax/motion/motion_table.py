@@ -134,28 +134,18 @@ def _(result: MotionTable) -> CsvColumns:
 
 def _frequency(seen: Observables, multiple: int) -> str:
     """Return the name of a multiple of the response frequency, with its value."""
-    order = seen.window.periods
+    names = {1: "the response frequency", seen.window.periods: "the drive's frequency"}
     khz = f"{multiple * seen.response_frequency_khz:.6g} kHz"
-    if multiple == order:
-        return f"the drive's frequency ({khz})"
-    if multiple == 1:
-        return f"the response frequency ({khz}, 1/{order} of the drive's)"
-    if multiple % order == 0:
-        return f"{multiple // order} times the drive's frequency ({khz})"
-    return f"{multiple} times the response frequency ({khz}, {multiple}/{order} of the drive's)"
+    return f"{names.get(multiple, f'{multiple} times the response frequency')} ({khz})"
 
 
 def _over_a_response(seen: Observables) -> list[str]:
     """Return the lines of what is read over whole response periods."""
     order = seen.window.periods
-    read = {each.multiple: (each.amplitude_nm, each.phase_deg) for each in seen.harmonics}
+    read = {order: (seen.drive_lockin_amplitude_nm, seen.drive_lockin_phase_deg)}
     read[1] = seen.lockin_amplitude_nm, seen.lockin_phase_deg
-    read[order] = seen.drive_lockin_amplitude_nm, seen.drive_lockin_phase_deg
-    first = (1, order) if seen.phase_lag_deg is None else (order, 1)
-    lines = [
-        f"At {_frequency(seen, multiple)}: {read[multiple][0]:.6g} nm, {read[multiple][1]:.6g} deg."
-        for multiple in dict.fromkeys((*first, *read))
-    ]
+    read |= {each.multiple: (each.amplitude_nm, each.phase_deg) for each in seen.harmonics}
+    lines = [f"At {_frequency(seen, k)}: {size:.6g} nm, {phase:.6g} deg." for k, (size, phase) in read.items()]
     if seen.peak_deflection_nm is not None:
         at = {
             order: (seen.deflection_drive_lockin_amplitude_nm, seen.deflection_drive_lockin_phase_deg),

@@ -42,8 +42,6 @@ class Orbit(NamedTuple):
     """N: drive periods in a response period."""
     impacts: int
     """m: impacts in a response period."""
-    contraction: float
-    """By which a small distance from it shrinks in a response period."""
     motion: Simulation
     """One response period."""
 
@@ -116,11 +114,10 @@ def _orbit_of(scene: Scene, near: np.ndarray, periods: int, run: Run) -> Orbit |
 
     omega = float(scene.cantilever.angular_frequency)
     found = close_periods(ends, near, np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
-    contraction = float(found.contraction[0])
-    if not found.closed[0] or not contraction < _ATTRACTS:
+    if not (found.closed[0] and found.contraction[0] < _ATTRACTS):
         return None
     motion = at(found.starts[:, 0])
-    return Orbit(motion.start, duration, periods, int(motion.count), contraction, motion)
+    return Orbit(motion.start, duration, periods, int(motion.count), motion)
 
 
 def ends_in_flight(motion: Simulation) -> np.ndarray:

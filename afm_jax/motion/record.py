@@ -35,13 +35,7 @@ class MotionOutcome(OutcomeInWords):
     STEP_LIMIT = 3, "The motion took more steps than it was given (max_rounds), or a search did not end."
     INVALID_START = 4, "The start is not finite, or inside the sample."
     NO_JUNCTION = 5, "With these parameters no junction forms: force and stiffness are equal nowhere."
-    UNRESOLVED = (
-        6,
-        (
-            "An integration step left the range of the forces, or close to capture a law's delay put the tip inside "
-            "the sample; the motion is not trusted beyond."
-        ),
-    )
+    UNRESOLVED = 6, "A step left the range of the forces, or a law's delay put the tip inside the sample."
 
 
 class ContactKind(enum.IntEnum):

@@ -154,8 +154,7 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
         return Settled(f"{where}, and its transient has decayed", contacts=0, periods=1, remaining=transient)
     rows = contacts_left(simulation)
     turns = rows.departure_time_us[None] / drive.period_us
-    velocities = rows.departure_velocity_nm_per_us[None]
-    found = find_repetitions(turns, velocities, tolerance=tolerance)
+    found = find_repetitions(turns, rows.departure_velocity_nm_per_us[None], tolerance=tolerance)
     contacts, periods, remaining = (column[0].item() for column in found)
     if not contacts:
         why = f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {turns.size} contacts)"
@@ -243,9 +242,7 @@ def last_fifth(first_us: float, last_us: float, drive: DrivePeriod, periods: int
         periods: N, drive periods in a response period.
     """
     span, response = last_us - first_us, periods * drive.period_us
-    whole = int(_LAST_FRACTION * span / response)
-    if whole == 0:
-        whole = int(span >= response)
+    whole = int(_LAST_FRACTION * span / response) or int(span >= response)
     return Window(last_us - (whole * response if whole else _LAST_FRACTION * span), last_us, periods, whole)
 
 

@@ -120,8 +120,8 @@ def _follow_free(cantilever: Cantilever, response: Surface | None, start: State,
         start: the tip at the start, in the lab.
         until: time of the end in us.
     """
-    _, position, velocity = with_response(response, start, -1.0)
-    final = with_response(response, State(until, *cantilever.propagator(until - start.time_us)(position, velocity)))
+    free = with_response(response, start, -1.0)
+    final = with_response(response, State(until, *cantilever.propagator(until - start.time_us)(*free[1:])))
     none, count = jnp.zeros((0,), until.dtype), jnp.zeros((), jnp.int32)
     sane = jnp.isfinite(final.position_nm) & jnp.isfinite(final.velocity_nm_per_us)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
@@ -152,15 +152,13 @@ def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> 
 
 
 def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface | None, start: State) -> None:
-    """Check what can be known of a contact scene before it is traced."""
-    leaves = jax.tree.leaves((scene, start))
-    if any(is_traced(leaf) for leaf in leaves):
-        return
+    """Check what is known of a contact scene."""
     junction = find_junction(scene.interaction)
     require_junction(scene.interaction, junction.exists)
     gap, rate = to_gap(surface, response, start)
     leaves = has_just_left(surface, end_of_contact(scene.interaction), start.time_us, gap, rate)
-    if not (bool(leaves) or float(gap) > float(junction.forms_gap_nm)):
+    outside = leaves | (gap > junction.forms_gap_nm)
+    if not (is_traced(outside) or bool(outside)):
         raise ValueError(
             f"the start is inside the sample: the gap is {float(gap):.6g} nm, but must be above "
             f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; start higher"

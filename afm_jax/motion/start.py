@@ -1,12 +1,15 @@
 """Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import free_frame, surface_of
+from afm_jax.apparatus.surface import Surface, free_frame, surface_of
 from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
@@ -14,10 +17,12 @@ from afm_jax.contact.junction import end_of_contact
 from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.record import State, with_response
+from afm_jax.motion.record import State, to_gap, to_lab
+from afm_jax.motion.trajectory import fly
+from afm_jax.solve.newton_steps import newton_steps
 
-_HIGHEST_ORDER = 200
-_NEWTON_STEPS = 12
+_NEWTON_STEPS, _CLOSE = 12, 1e-9
+"""Steps to where a flight has risen to a gap, and what may be left of that in nm."""
 _PUSH = 1e-3
 """Of the rebound speed, by which a start misses an unstable orbit: rounding may hold a tip there for ever."""
 
@@ -52,8 +57,7 @@ def default_start(scene: Scene) -> State:
     on_orbit = _on_orbit(scene, still, law) if periodic and law is not None else None
     if on_orbit is not None:
         return on_orbit
-    sample_alone = scene.base is None and scene.force is None
-    if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * float(gap_of_departure(scene)) + 1.0:
+    if (scene.base or scene.force) and -scene.platform.position(0.0) > 2.0 * gap_of_departure(scene) + 1.0:
         return state(0.0, 0.0, 0.0)
     return _leaving(scene)
 
@@ -94,8 +98,6 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     """Return the state just after the impact of the predicted orbit, that of the scene without ramp; None without."""
     omega = drive_of(still).angular_frequency
     order = max(1, round(omega / (2.0 * float(scene.cantilever.angular_frequency))))
-    if order > _HIGHEST_ORDER:
-        return None
     predicted = eqx.tree_at(lambda s: s.interaction, still, law)
     orbits = single_impact_orbits(predicted, float(order))
     admissible = np.asarray(orbits.exists) & np.asarray(orbits.admissible)
@@ -106,27 +108,29 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     slot = int(np.argmax(np.where(wanted, np.asarray(orbits.approach_speed_nm_per_us), -np.inf)))
     time = float(orbits.phase_rad[slot]) / omega
     velocity = float(orbits.velocity_after_nm_per_us[slot])
+    height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
     if not isinstance(scene.interaction, Contact):
-        height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
         return state(time, height, velocity if stable.any() else velocity + _PUSH * (velocity - speed))
-    return _risen(scene, time, velocity, float(gap_of_departure(scene)))
+    begin = state(time, height, velocity)
+    risen, rises = _risen(scene.cantilever, *surface_of(scene), begin, gap_of_departure(scene))
+    return risen if rises else None
 
 
-def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
-    """Return where a flight that leaves the platform first has a gap; None if it does not rise that far."""
-    surface, response = surface_of(scene)
-    position, leaving = (float(part) for part in surface.position_and_velocity(time))
-    free = float(with_response(response, state(time, position, velocity), -1.0).velocity_nm_per_us)
-    duration, v = gap / (free - leaving), free
-    for _ in range(_NEWTON_STEPS):
-        height, speed = (float(part) for part in surface.position_and_velocity(time + duration))
-        z, v = (float(part) for part in scene.cantilever.propagator(duration)(position, free))
-        if not v > speed:
-            return None
-        duration += (gap - (z - height)) / (v - speed)
-    end = time + duration
-    v = float(with_response(response, state(end, 0.0, v)).velocity_nm_per_us)
-    return state(end, float(scene.platform.position(end)) + gap, v)
+@jax.jit
+def _risen(
+    cantilever: Cantilever, surface: Platform | Surface, response: Surface | None, begin: State, gap: Float[Array, ""]
+) -> tuple[State, Bool[Array, ""]]:
+    """Return where a flight that leaves the platform first has a gap, and whether it rises that far."""
+    leaving = to_gap(surface, response, begin)
+
+    def missing(end: Array) -> tuple[Array, Array]:
+        reached, rate = fly(cantilever, surface, *leaving, begin.time_us, end)
+        return reached - gap, rate
+
+    end = newton_steps(missing, begin.time_us + gap / leaving[1], _NEWTON_STEPS)
+    short, rate = missing(end)
+    rises = (end >= begin.time_us) & (rate > 0.0) & (jnp.abs(short) < _CLOSE * (1.0 + gap))
+    return to_lab(surface, response, end, gap, rate), rises
 
 
 def _leaving(scene: Scene) -> State:

@@ -26,6 +26,7 @@ from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab, where
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import filled, power_of_two
+from afm_jax.solve.newton_steps import newton_steps
 
 _BLOCK, _FEWEST = 128, 8
 """Trials computed in one call, and contacts at least."""
@@ -285,19 +286,17 @@ def _states_at(
     # in the junction the variable is fictitious time: its value at a time is a root
     rates = driven.rates(start, solid)
 
-    def newton(_, length):
-        end = stepped(length)
-        passing = driven.rates(end, solid).time_us
+    def late(length):
         # time stands still at the fold
-        return length + (time_us - end.time_us) / jnp.where(passing == 0.0, 1.0, passing)
+        end = stepped(length)
+        return end.time_us - time_us, driven.rates(end, solid).time_us
 
     elapsed = time_us - start.time_us
     # time stands still where a dry contact begins, and grows with the square of the variable
     _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (rates.x,))
     root = jnp.sqrt(jnp.maximum(rates.time_us**2 + 2.0 * growth * elapsed, 0.0))
     first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rates.time_us + root, 1e-9), elapsed)
-    length = lax.fori_loop(0, _NEWTON_STEPS, newton, first)
-    end = stepped(length)
+    end = stepped(newton_steps(late, first, _NEWTON_STEPS))
     return driven.gap(end.x, phase), end.gap_rate
 
 

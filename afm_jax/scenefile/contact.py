@@ -3,10 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
-from afm_jax.checks import check_parameter, is_traced
+from afm_jax.checks import check_parameter
 from afm_jax.contact.contact import FORCES, Contact, check_effects
 from afm_jax.contact.junction import find_junction, require_junction
 from afm_jax.contact.parameters import CONTACT_RANGES
@@ -30,8 +29,7 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
     contact = Contact.of(tuple(effects), **parameters)
-    if not any(map(is_traced, parameters.values())):
-        require_junction(contact, _junction_of(contact).exists)
+    require_junction(contact, find_junction(contact).exists)
     return contact
 
 
@@ -63,7 +61,3 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
                 raise ValueError(f"a scene file has one `{name}`, but the contact's forces have different ones")
             values[name] = value
     return {name: values[name] for name in CONTACT_RANGES if name in values}
-
-
-_junction_of = eqx.filter_jit(find_junction)
-"""`find_junction`, with one compilation for every choice of effects."""

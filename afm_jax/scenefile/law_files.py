@@ -85,11 +85,9 @@ def save_law(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
 
 
 def save_law_csv(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
-    """Write a law's table to a CSV that `load_law` reads: its columns with their units, mass, range and origin."""
+    """Write a law's table to a CSV that `load_law` reads: its columns with their units, mass and origin."""
     told = as_json(law)
-    low, high = told["speed_range_nm_per_us"]
-    comments = [f"# speeds: {low:.6g} to {high:.6g} nm/us"]
-    comments += [f"# {key} = {told[key]}" for key in ("mass_ng", "origin", "capture_speed_nm_per_us") if key in told]
+    comments = [f"# {key} = {told[key]}" for key in ("mass_ng", "origin", "capture_speed_nm_per_us") if key in told]
     if told.get("corrections") is False:
         comments.append("# corrections = false")
     names = [name for name in _WRITTEN if name in told]
@@ -109,22 +107,19 @@ def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
     kind = contents.get("format") if isinstance(contents, dict) else None
     if kind not in (FORMAT, FIT_FORMAT):
         raise ValueError(f"holds no law; {_GIVE}")
-    law, mend = contents, "write it anew with `afm-jax collide --make-law --out DIR`"
+    mend = "write it anew with `afm-jax collide --make-law --out DIR`"
     if kind == FIT_FORMAT:
         wrong = why_no_fit(contents)
         if wrong is not None:
             raise ValueError(wrong)
         if not contents.get("valid"):
             raise ValueError("the fit is not valid, and neither is its law; give a valid one")
-        law, mend = contents.get("law"), "fit again with `afm-jax fit TABLE --out DIR`"
-        if not isinstance(law, dict) or not isinstance(law.get("numbers"), dict):
-            raise ValueError(f"is a fit without a law; {mend}")
+        mend = "fit again with `afm-jax fit TABLE --out DIR`"
     elif contents.get("format_version") != FORMAT_VERSION:
-        raise ValueError(
-            f"has format_version {contents.get('format_version')}, but {FORMAT_VERSION} is known here; {mend}"
-        )
+        raise ValueError(f"has format_version {contents.get('format_version')}, not {FORMAT_VERSION}; {mend}")
     try:
-        return law_of_dict(law), contents if kind == FIT_FORMAT else {}
+        fitted = kind == FIT_FORMAT
+        return law_of_dict(contents["law"] if fitted else contents), contents if fitted else {}
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
         # an entry of another kind than is written there
         raise ValueError(f"its law is damaged; {mend}") from error

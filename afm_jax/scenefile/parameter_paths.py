@@ -64,19 +64,16 @@ def parse_range(text: str | ParameterRange, *, counted: bool) -> ParameterRange:
     shape = "PARAMETER=low:high:count" if counted else "PARAMETER=low:high"
     example = f"platform.reduced_frequency=0.9:1.1{':100' if counted else ''}"
     path, _, rest = text.partition("=")
-    parts = [part.strip() for part in rest.split(":")]
     try:
-        low, high = float(parts[0]), float(parts[1])
-    except (IndexError, ValueError):
-        low = high = math.nan
-    rises = low < high and math.isfinite(low) and math.isfinite(high)
-    if not path.strip() or len(parts) != (3 if counted else 2) or not rises:
+        low, high = map(float, rest.split(":")[:2])
+        count = [int(part) for part in rest.split(":")[2:]]
+    except ValueError:
+        low, high, count = math.nan, math.nan, []
+    if not path.strip() or not -math.inf < low < high < math.inf or len(count) != counted:
         raise ValueError(f"`{text}` is no rising range of a parameter; write {shape} as in {example}")
-    if not counted:
-        return ParameterRange(path.strip(), low, high)
-    if not (parts[2].isascii() and parts[2].isdigit() and 2 <= int(parts[2]) <= _MOST_VALUES):
-        raise ValueError(f"`{text}`: the number of values must be from 2 to {_MOST_VALUES}, but is {parts[2]}")
-    return ParameterRange(path.strip(), low, high, int(parts[2]))
+    if counted and not 2 <= count[0] <= _MOST_VALUES:
+        raise ValueError(f"`{text}`: the number of values must be from 2 to {_MOST_VALUES}, but is {count[0]}")
+    return ParameterRange(path.strip(), low, high, *count)
 
 
 def parameter_values(scene: Scene) -> dict[str, float]:

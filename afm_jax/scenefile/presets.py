@@ -1,4 +1,4 @@
-"""The paper's scenes by name, and with what figures 2, 3 and 9 vary as arguments (they can be batched by `vmap`).
+"""The paper's scenes by name, and with what its figures vary as arguments (they can be batched by `vmap`).
 
 The reduced frequency is n = omega/2 Omega; the free frequency is 90 kHz throughout. Sections II and III leave air
 damping out; section IV, with the resolved contact, has Q = 40. Figures 4 to 7 show the contact alone,
@@ -8,7 +8,7 @@ damping out; section IV, with the resolved contact, has Q = 40. Figures 4 to 7 s
 from collections.abc import Callable
 from functools import partial
 
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -18,38 +18,27 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.scenefile.tables import Start
 
 FREE_FREQUENCY_KHZ = 90.0
-STABILITY_R = 0.5
-"""Coefficient of restitution of figures 2 and 3."""
-ADHESION = 1.0
-"""Epsilon of figures 3 and 9 in nm^2/us^2 = uJ/kg."""
 
 
-def figure2_scene(reduced_frequency: ArrayLike, drive_amplitude_nm: ArrayLike, epsilon: ArrayLike = 0.0) -> Scene:
-    """Return a point of figure 2: r = 0.5, sigma = -1 nm, no air damping.
+def law_scene(
+    reduced_frequency: ArrayLike,
+    drive_amplitude_nm: ArrayLike,
+    offset_nm: ArrayLike = -1.0,
+    r: ArrayLike = 0.5,
+    epsilon: ArrayLike = 0.0,
+) -> Scene:
+    """Return a scene of sections II and III: a law, 90 kHz, no air damping; a point of figure 2 by its first two.
 
     Args:
         reduced_frequency: n = omega/2 Omega.
         drive_amplitude_nm: beta.
-        epsilon: adhesion in nm^2/us^2, that of figure 3 if not 0.
-    """
-    platform = Platform(drive_amplitude_nm, _drive_frequency_khz(reduced_frequency), -1.0)
-    return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(STABILITY_R, epsilon))
-
-
-figure3_scene = partial(figure2_scene, epsilon=ADHESION)
-"""A point of figure 3: figure 2 with adhesion."""
-
-
-def figure9_scene(reduced_frequency: ArrayLike, offset_nm: ArrayLike, r: ArrayLike) -> Scene:
-    """Return a point of figure 9: beta = 0.75 nm, with adhesion, no air damping.
-
-    Args:
-        reduced_frequency: 0.97 in figure 9a, just below the first resonance, 1.03 in figure 9b, just above it.
         offset_nm: sigma.
         r: coefficient of restitution.
+        epsilon: adhesion in nm^2/us^2 = uJ/kg; 1 in figures 3 and 9.
     """
-    platform = Platform(0.75, _drive_frequency_khz(reduced_frequency), offset_nm)
-    return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(r, ADHESION))
+    drive = 2.0 * FREE_FREQUENCY_KHZ * as_argument(reduced_frequency)
+    platform = Platform(drive_amplitude_nm, drive, offset_nm)
+    return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(r, epsilon))
 
 
 def contact_scene(
@@ -72,15 +61,10 @@ def contact_scene(
     # only here, so that files of scenes with a law do without the contact's modules
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
 
-    drive = _drive_frequency_khz(reduced_frequency)
+    drive = 2.0 * FREE_FREQUENCY_KHZ * as_argument(reduced_frequency)
     platform = Platform(drive_amplitude_nm, drive, offset_nm, offset_rate_nm_per_us)
     contact = Contact.of(("van_der_waals", "dmt")) if dry else Contact.paper()
     return Scene(Cantilever(FREE_FREQUENCY_KHZ, 40.0, 1.0), platform, contact)
-
-
-def _drive_frequency_khz(reduced_frequency: ArrayLike) -> Float[Array, "..."]:
-    """Return the drive frequency 2 n Omega / 2 pi of a reduced frequency n."""
-    return 2.0 * FREE_FREQUENCY_KHZ * as_argument(reduced_frequency)
 
 
 _RAMP_NM_PER_US = 1e-3
@@ -89,16 +73,16 @@ does not say how slow its change was."""
 
 PRESETS: dict[str, Callable[[], Scene]] = {
     # of a chart the point n = 1, drive amplitude 2 nm
-    "figure2": partial(figure2_scene, 1.0, 2.0),
-    "figure3": partial(figure3_scene, 1.0, 2.0),
+    "figure2": partial(law_scene, 1.0, 2.0),
+    "figure3": partial(law_scene, 1.0, 2.0, epsilon=1.0),
     # The paper's strange attractor. Followed longer, it is transient chaos: from all twelve starts of the notebook on
     # the paper's figures (drive phase 270 degrees, 5 nm above the platform, upward at 40 to 110 nm/us) the motion locks
     # to the (1,5) orbit in the end, after some tens to a thousand broadband impacts. After how many is a matter of
     # rounding, and so of the machine; while it lasts, small distances grow by an exponent of about 0.8 an impact.
     "figure8": partial(contact_scene, 5.277, 4.0, 0.0),
     # just below and just above resonance
-    "figure9a": partial(figure9_scene, 0.97, 0.0, 0.9),
-    "figure9b": partial(figure9_scene, 1.03, 0.0, 0.9),
+    "figure9a": partial(law_scene, 0.97, 0.75, 0.0, 0.9, 1.0),
+    "figure9b": partial(law_scene, 1.03, 0.75, 0.0, 0.9, 1.0),
     # below resonance; the offset rises from -0.5 nm, to the paper's 5 nm in 5500 us
     "figure10": partial(contact_scene, 0.97, 2.0, -0.5, _RAMP_NM_PER_US),
     # above resonance; the offset rises from -2 nm, to 2 nm in 4000 us

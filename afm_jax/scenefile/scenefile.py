@@ -55,7 +55,7 @@ import tomli_w
 from jaxtyping import ArrayLike
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
@@ -66,7 +66,6 @@ from afm_jax.saved import as_json
 from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.presets import PRESETS, STARTS
 from afm_jax.scenefile.tables import (
-    INNER_TABLES,
     KEYS,
     MODELS,
     TABLES,
@@ -125,7 +124,7 @@ def read_scene(path: str | os.PathLike[str]) -> SceneAsRead:
     tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)
     stated = {"mass_ng", "spring_constant_n_per_m"} & set(tables["cantilever"].values)
-    assumed = tables["interaction"].model == "contact" and not stated
+    assumed = tables["interaction"].values["model"] == "contact" and not stated
     notes, table = (f"{MASS_ASSUMED} in [cantilever].",) if assumed else (), tables.get("start")
     if table is None:
         return SceneAsRead(scene, None, notes)
@@ -191,10 +190,8 @@ def read_toml(source: str) -> dict[str, Any]:
     where, text = printable(source), read_text(source)
     try:
         return tomllib.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
-    except RecursionError:
-        raise SceneError(f"{where}: not TOML: too many brackets within each other") from None
 
 
 def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
@@ -203,25 +200,25 @@ def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
         if name not in TABLES:
             message = advise_table(name, is_table=isinstance(value, dict))
             raise SceneError(f"{printable(source)}: {printable(name)}: {message}")
-    tables = {name: _table(source, name, value) for name, value in contents.items()}
+    tables = {name: _table(source, name, value) for name, value in {**contents, **_inner(contents)}.items()}
     for name in ("cantilever", "platform", "interaction"):
         if name not in tables:
-            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
+            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in KEYS)
             raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
     # looked at first: it decides which keys are known
     model = tables["interaction"].values.get("model")
     if model not in MODELS:
-        wrong = "missing; add model =" if model is None else "must be"
-        tables["interaction"].fail(f'{wrong} "law" or "contact", or "none" for a free cantilever', "model")
-    tables["interaction"] = tables["interaction"]._replace(model=model)
+        tables["interaction"].fail('must be "law" or "contact", or "none" for a free cantilever', "model")
     for table in tables.values():
-        table.check()
-    for name in INNER_TABLES:
-        outer, _, key = name.partition(".")
-        if outer in tables and key in tables[outer].values:
-            tables[name] = _table(source, name, tables[outer].values[key])
-            tables[name].check()
+        table.check(model)
     return tables
+
+
+def _inner(contents: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables inside others, by the names that headings give them."""
+    outer = [(name, table) for name, table in contents.items() if isinstance(table, dict)]
+    inside = {f"{name}.{key}": value for name, table in outer for key, value in table.items()}
+    return {name: value for name, value in inside.items() if name in KEYS}
 
 
 def _table(source: str, name: str, value: Any) -> SceneTable:
@@ -258,14 +255,8 @@ def _drive_of(tables: Mapping[str, SceneTable], name: str, cantilever: Cantileve
     numbers = _tone(table, name, cantilever, may_rest=may_rest and of_second is None)
     if of_second is not None:
         own = _tone(of_second, name, cantilever)
-        second = numbers["second"] = of_second.build(Tone, own.pop(_amplitude(name)), **own)
-        both = numbers["frequency_khz"], second.frequency_khz
-        if not any(map(is_traced, both)) and np.all(np.isclose(*both, rtol=SAME_FREQUENCY, atol=0.0)):
-            of_second.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
-    drive = table.build(_KINDS[name], **numbers)
-    if name != "platform":
-        table.build(check_steady_response, cantilever, drive.tones, name)
-    return drive
+        numbers["second"] = of_second.build(Tone, own.pop(_amplitude(name)), **own)
+    return table.build(_KINDS[name], **numbers)
 
 
 def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: bool = False) -> dict[str, Any]:
@@ -284,10 +275,10 @@ def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: boo
     if "frequency_khz" not in numbers and not (may_rest and not numbers.get(amplitude)):
         table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
     table.build(check_parameter, given, numbers.get(given, 0.0), "not negative")
-    if given == free:
-        # the tone's amplitude only says that it moves
-        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
+    if name != "platform":
+        tone = table.build(Tone, numbers[given], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
+    if given == free:
         per_height = drive_per_free_height(cantilever, numbers["frequency_khz"], _KINDS[name])
         numbers[amplitude] = numbers.pop(free) * per_height
     return numbers
@@ -295,9 +286,10 @@ def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: boo
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:
     table = tables["interaction"]
-    if table.model == "none":
+    model = table.values["model"]
+    if model == "none":
         return None
-    if table.model == "contact":
+    if model == "contact":
         # only here, so that scenes with a law do without the contact's modules
         from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
         from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
@@ -324,11 +316,10 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
 
 def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[str, Any]:
     table = _numbers_of(drive, name)
-    second = drive.second
-    if second is None:
-        return table
-    amplitude = {_amplitude(name): _number_of(second.amplitude, _amplitude(name))}
-    return {**table, "second": {**amplitude, **_numbers_of(second, f"{name}.second")}}
+    if drive.second is not None:
+        amplitude = _number_of(drive.second.amplitude, _amplitude(name))
+        table["second"] = {_amplitude(name): amplitude, **_numbers_of(drive.second, f"{name}.second")}
+    return table
 
 
 def _amplitude(name: str) -> str:
@@ -394,7 +385,7 @@ _TOUCHING_NM = 1e-9
 
 
 def check_start(start: Start, scene: Scene) -> None:
-    """Check that a tip can begin at a start: outside the sample, and not on its way into it from its surface.
+    """Check that a tip can begin at a start: outside the sample.
 
     Args:
         start: the start.
@@ -403,23 +394,15 @@ def check_start(start: Start, scene: Scene) -> None:
     Raises:
         ValueError: if it cannot; says why.
     """
-    height = start.height_above_platform_nm
     for name, value in start._asdict().items():
         check_parameter(name, value, "finite")
     if scene.interaction is None:
         return
+    height = start.height_above_platform_nm
     law = isinstance(scene.interaction, Law)
-    if abs(height) <= _TOUCHING_NM and (law or not scene.interaction.spans):
-        # a tip at rest on the platform rides until the platform lets go
-        moving = float(scene.platform.velocity(start.phase_deg / 360.0 * float(scene.platform.period_us)))
-        if start.velocity_nm_per_us < moving:
-            raise ValueError(
-                f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but "
-                f"is {start.velocity_nm_per_us:.6g}: start faster or higher"
-            )
-        return
-    # else the tip would start inside the sample; whether it starts inside a junction, `simulate` says
-    check_parameter("height_above_platform_nm", height, "not negative" if law else "above 0")
+    # else the tip would start inside the sample; whether it starts inside a junction or sinks, `simulate` says
+    if abs(height) > _TOUCHING_NM or not (law or not scene.interaction.spans):
+        check_parameter("height_above_platform_nm", height, "not negative" if law else "above 0")
 
 
 def as_in_file(scene: Scene, state: State) -> Start:

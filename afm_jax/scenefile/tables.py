@@ -29,19 +29,14 @@ KEYS = {
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
 
-_NO_NUMBERS = {"model": str, "effects": list, "delay": dict, "corrections": bool, "file": str, "table": dict}
-_NO_NUMBERS["second"] = dict
+_KINDS = {"model": str, "effects": list, "delay": dict, "corrections": bool, "file": str, "table": dict, "second": dict}
 """Keys that hold something else than a number, and what."""
 
-_EITHER = (("frequency_khz", "reduced_frequency"),)
-_EITHER += (("amplitude_nm", "free_amplitude_nm"), ("amplitude_nn", "free_amplitude_nm"))
+_EITHER = (_FREQUENCY, ("amplitude_nm", "free_amplitude_nm"), ("amplitude_nn", "free_amplitude_nm"))
 """Keys that say the same in two ways."""
 
 TABLES = tuple(name for name in KEYS if "." not in name)
 """The tables at the top of a file."""
-
-INNER_TABLES = tuple(name for name in KEYS if "." in name)
-"""The tables inside others."""
 
 MODELS = ("law", "contact", "none")
 """The models of an interaction; "none": a free cantilever."""
@@ -66,8 +61,8 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     'unknown key; use frequency_khz'
     >>> advise_key("cantilever", "frequency")
     'unknown key; use frequency_khz'
-    >>> advise_key("platform", "quality_factor")
-    'unknown key; it belongs in [cantilever]'
+    >>> advise_key("start", "speed")
+    'unknown key; use one of phase_deg, height_above_platform_nm, velocity_nm_per_us'
     >>> advise_key("force", "amplitude_nm")
     'unknown key; use amplitude_nn'
     >>> advise_key("interaction", "viscosity_pa_s", "law")
@@ -82,14 +77,8 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
     if table == "interaction" and others:
         return f'unknown key of model = "{model}"; it belongs to model = "{others[0]}"'
-    without_unit = [name for name in keys if name.startswith(f"{plain}_")]
-    nearest = next(iter(without_unit), None) or nearest_name(plain, keys)
-    if nearest:
-        return f"unknown key; use {nearest}"
-    owners = _owners(plain)
-    if owners:
-        return f"unknown key; it belongs in {' or '.join(owners)}"
-    return f"unknown key; use one of {', '.join(keys)}"
+    nearest = next((name for name in keys if name.startswith(f"{plain}_")), None) or nearest_name(plain, keys)
+    return f"unknown key; use {nearest or 'one of ' + ', '.join(keys)}"
 
 
 def advise_table(name: str, *, is_table: bool) -> str:
@@ -102,17 +91,10 @@ def advise_table(name: str, *, is_table: bool) -> str:
         name: what the file has there.
         is_table: whether it is a table there, or a key outside any table.
     """
-    plain = name.casefold()
     if not is_table:
-        tables = _owners(plain) or [f"[{table}]" for table in TABLES]
-        return f"stands outside any table; write it below {' or '.join(tables)}"
-    nearest = nearest_name(plain, TABLES)
+        return "stands outside any table; write it below the [table] that it belongs to"
+    nearest = nearest_name(name.casefold(), TABLES)
     return f"unknown table; use {', '.join(f'[{table}]' for table in ([nearest] if nearest else KEYS))}"
-
-
-def _owners(key: str) -> list[str]:
-    """Return the tables that have a key, in brackets, but for second frequencies, which have the keys of the first."""
-    return [f"[{table}]" for table, keys in KEYS.items() if key in keys and not table.endswith(".second")]
 
 
 Built = TypeVar("Built")
@@ -156,29 +138,30 @@ class SceneTable(NamedTuple):
         source: the file's name, as it begins every message.
         name: the table's name, a key of `KEYS`.
         values: what it contains.
-        model: of the scene's interaction, one of `MODELS`.
     """
 
     source: str
     name: str
     values: Mapping[str, Any]
-    model: str = "law"
 
     def fail(self, message: str, key: str | None = None) -> NoReturn:
         """Raise a `SceneError` that names the file, this table and the key."""
         where = f"{printable(self.source)}: [{self.name}] "
         raise SceneError(f"{where}{message}" if key is None else f"{where}{printable(key)}: {message}")
 
-    def check(self) -> None:
+    def check(self, model: str) -> None:
         """Check that the table has no unknown keys, none that contradict each other, and of each key what it holds.
+
+        Args:
+            model: of the scene's interaction, one of `MODELS`.
 
         Raises:
             SceneError: if not, at the first that is wrong.
         """
         for key, value in self.values.items():
-            if key not in keys_of(self.name, self.model):
-                self.fail(advise_key(self.name, key, self.model), key)
-            kind = _NO_NUMBERS.get(key, float)
+            if key not in keys_of(self.name, model):
+                self.fail(advise_key(self.name, key, model), key)
+            kind = _KINDS.get(key, float)
             good = isinstance(value, kind) and (kind is not list or all(isinstance(each, str) for each in value))
             if kind is float:
                 # arrays are those of a scene whose numbers are replaced, maybe by traced ones
@@ -206,7 +189,7 @@ class SceneTable(NamedTuple):
         return {
             key: value if is_array(value) else float(str(value))
             for key, value in self.values.items()
-            if key not in _NO_NUMBERS
+            if key not in _KINDS
         }
 
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
