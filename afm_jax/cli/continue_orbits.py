@@ -23,10 +23,10 @@ def follow(
 ) -> Output:
     """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
-    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
-    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
-    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a 95 %
-    interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    Folds, period doublings, grazings and captures are located to rounding; with --second they are followed as curves in
+    two parameters. In a scene with a contact the simulation is closed instead of the map, and curves end where the
+    orbit grazes or is captured. With --law every special point has a 95 % interval. With --out tables and pictures.
+    Exit code 3 if there is no admissible orbit in the range.
 
     Args:
         session: for progress.

@@ -96,7 +96,7 @@ def amplitude_errors(
     uncertain = uncertain.without(continuation.range.path)
     family = _with_uncertain(continuation, uncertain, None)
     points = np.column_stack([branch.points, np.tile(uncertain.values, (len(branch.points), 1))])
-    slope = in_blocks(lambda block: _amplitude_slopes(family, block), points, block=BLOCK, widths=())
+    slope = in_blocks(lambda block: _amplitude_slopes(family, block), points, widths=(BLOCK,))
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
 

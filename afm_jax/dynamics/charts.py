@@ -31,7 +31,7 @@ from afm_jax.report import Section, sections
 from afm_jax.results import Result, public_result
 from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
-from afm_jax.solve.lanes import Report, again_for, in_blocks
+from afm_jax.solve.lanes import WIDTHS, Report, again_for, in_blocks
 
 
 class OrbitVerdicts(NamedTuple):
@@ -80,7 +80,7 @@ def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | Non
         return OrbitVerdicts(stable, admissible, **{name: orbits[name] for name in names})
 
     # few enough for the cache, many enough to fill the vector units
-    return jax.tree.map(np.transpose, in_blocks(work, seen, block=1024, report=report))
+    return jax.tree.map(np.transpose, in_blocks(work, seen, widths=(*WIDTHS, 1024), report=report))
 
 
 ORBIT_NUMBERS = (

@@ -395,7 +395,7 @@ class ContactLoops(LoopFamily):
         trace, determinant = trace_and_determinant(flown.maps)
         near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
         speeds = np.array([near, np.split(flown.loop, 2)[1].min()]) / float(self.speed_unit)
-        return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
+        return np.append(np.array([1.0 - trace, 1.0 + trace]) + determinant, speeds)
 
 
 def _reading_of(flown: FlownLoop) -> LoopReading:

@@ -18,7 +18,7 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
-from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
+from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on
 from afm_jax.dynamics.impact_loop import CAPTURE, LoopFamily, driven_part
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, impact_rows, orbit_facts
 from afm_jax.dynamics.special_points import (
@@ -146,9 +146,7 @@ def _(result: Continuation) -> dict[str, Any]:
         "second": None if result.second is None else result.second.path,
         "points": _point_rows(result),
         "special": _special_rows(result),
-        "curves": [
-            curve._asdict() | {"meetings": [meeting._asdict() for meeting in curve.meetings]} for curve in result.curves
-        ],
+        "curves": [curve._asdict() for curve in result.curves],
         "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in result.branches],
         "law_parameters": result.law_parameters,
     }
@@ -176,10 +174,6 @@ def _(result: Continuation) -> list[Section]:
     for curve in result.curves:
         ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
         parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
-        parts += [
-            f"    {meeting.kind.replace('_', ' ')} at ({meeting.parameter:.6g}, {meeting.second:.6g})"
-            for meeting in curve.meetings
-        ]
     kind = f"({result.impacts}, {result.order}) orbits"
     return [Section(f"{'' if result.branches else 'No '}{kind} with {result.range}", parts)]
 
@@ -317,7 +311,7 @@ def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
     for place in (0, -1):
         if ends[place] == "capture":
             leg = curve.legs[place]
-            root = root_on(leg, tested_by(CAPTURE, family), family)
+            root = root_on(leg, CAPTURE, family)
             # of the last step's way to capture: there the orbit still exists
             last = None if root is None else leg.at(root[0] + 1e-6 * (1 + place - root[0]), family)
             points[place] = (leg.end if place == 0 else leg.begin).point if last is None else last.point

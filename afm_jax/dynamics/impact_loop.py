@@ -36,8 +36,8 @@ from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import power_of_two
 from afm_jax.units import within_turn
 
-KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
-FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
+KINDS = ("fold", "period_doubling", "grazing", "capture")
+FOLD, DOUBLING, GRAZING, CAPTURE = range(len(KINDS))
 """Kinds of special points, by the numbers of the test functions that are 0 there (`LoopFamily.tests`)."""
 
 
@@ -364,7 +364,6 @@ class LoopFamily(eqx.Module):
 
             fold             1 - T + D; on curves in one parameter the tangent's component along it counts instead
             period_doubling  1 + T + D, a multiplier -1
-            torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
             grazing          the lowest point of a flight above the surface
             capture          the distance of the slowest impact from capture; without adhesion its speed
         """

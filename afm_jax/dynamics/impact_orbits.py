@@ -162,7 +162,7 @@ class LawLoops(LoopFamily):
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
         some = points if len(points) else np.ones((1, points.shape[1]))
-        return jax.tree.map(lambda leaf: leaf[: len(points)], in_blocks(self._read, some, block=BLOCK, widths=()))
+        return jax.tree.map(lambda leaf: leaf[: len(points)], in_blocks(self._read, some, widths=(BLOCK,)))
 
     @jax.jit
     def _read(self, points: Float[Array, "points n"]) -> LoopReading:
@@ -197,7 +197,6 @@ class LawLoops(LoopFamily):
         return [
             1.0 - trace + determinant,
             1.0 + trace + determinant,
-            determinant - 1.0,
             near * loop.cantilever.angular_frequency / loop.speed_unit,
             slowest - loop.impact.lowest / loop.speed_unit,
         ]

@@ -24,7 +24,7 @@ from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, gap_of_departure, rebound_of_leaving
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import WIDTHS, in_blocks
 
 
 class SampleDriven(NamedTuple):
@@ -154,7 +154,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
     def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
         return _on_orbits(*lanes)
 
-    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=128)
+    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), widths=WIDTHS[:-1])
     return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
 
 

@@ -271,7 +271,7 @@ def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Col
     """Return a function of columns of any length, block by block on all cores; blocks of one shape, so one program."""
     # what a processor's cache holds, or what fills an accelerator
     block = 1024 if jax.default_backend() == "cpu" else 1 << 16
-    return partial(in_blocks, jax.jit(record), block=block, widths=(block,))
+    return partial(in_blocks, jax.jit(record), widths=(block,))
 
 
 def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callable[[Columns], Columns]:
@@ -392,7 +392,7 @@ def _lyapunov(
         return results
 
     # blocks of one width, so that there is one shape of every program
-    work = partial(in_blocks, record, block=lanes, widths=(lanes,))
+    work = partial(in_blocks, record, widths=(lanes,))
     points, words = lanes if resolved else 4 * lanes, {"kind": _codes(MotionKind)}
     return Recorder(work, points, exponents[:2], {"exponent": (1, 2)}, words, alone=resolved)
 
