@@ -33,7 +33,7 @@ def bifurcation(  # noqa: PLR0913
     fit's draws with the same motion. Exit code 3 if no motion went on anywhere.
 
     Args:
-        session: for progress and messages.
+        session: for progress.
         scene: the scene.
         parameter: a parameter of the scene file and its values.
         both: ramp up and then down, so that hysteresis shows.
@@ -55,7 +55,5 @@ def bifurcation(  # noqa: PLR0913
             for number, sweep in enumerate(sweeps):
                 share = verdict_probability(scene.scene, swept.path, sweep, scene.unknowns, draws=draws, **how)
                 sweeps[number] = sweep._replace(verdict_probability=share)
-    if not all(sweep.complete for sweep in sweeps):
-        session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)
     return Output.of(ramps, files={"bifurcation.png": picture_of("dynamics:bifurcation_figure", ramps, ordinate)})

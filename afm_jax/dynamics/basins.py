@@ -18,8 +18,9 @@ from afm_jax.checks import checked
 from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Tips, recorded
-from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
+from afm_jax.dynamics.starts import evenly_spread, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
+from afm_jax.motion.start import rebound_of_leaving
 from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.saved import as_json
@@ -175,9 +176,7 @@ def basins_of_attraction(
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:
         raise ValueError("basins are those of one scene, on a grid of 2 x 2 starts or more")
     if speeds_nm_per_us is None:
-        batch = jax.tree.map(lambda leaf: leaf[None], scene)
-        usual = leaving_tips(batch)
-        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - _velocity(batch.platform, usual.time_us))[0]))
+        speeds_nm_per_us = 0.0, 4.0 * float(rebound_of_leaving(scene))
     low, high = speeds_nm_per_us
     if not 0.0 <= low < high:
         raise ValueError(f"`speeds_nm_per_us` must rise from 0 or more, but is {speeds_nm_per_us}")
@@ -254,7 +253,7 @@ class _Finder:
     def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
         """Return the attractors of motions after a long time; new ones are added to those known."""
         count = len(tips.time_us)
-        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, accuracy=1e-6, report=report)
+        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, report=report)
         names, label = verdicts.names(), np.empty(count, int)
         for lane, m in enumerate(verdicts.impacts.tolist()):
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])

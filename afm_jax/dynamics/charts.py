@@ -20,9 +20,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.checks import check_kind, checked
 from afm_jax.columns import CsvColumns, csv_columns
-from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
-from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.starts import SampleDriven, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import impact_law_of
@@ -40,20 +38,14 @@ class OrbitVerdicts(NamedTuple):
     ``stable``: an orbit that is admissible and stable. ``admissible``: an admissible orbit, stable or not.
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
-    ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
-    ``approach_speed_nm_per_us``, of laws only: of the stable one's impact.
+    ``approach_speed_nm_per_us``: of the stable one's impact.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
     admissible: Bool[np.ndarray, "orders scenes"]
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
     largest_multiplier: Float[np.ndarray, "orders scenes"]
-    unresolved: Bool[np.ndarray, "orders scenes"] | None = None
-    approach_speed_nm_per_us: Float[np.ndarray, "orders scenes"] | None = None
-
-    def any_stable(self) -> Bool[np.ndarray, " scenes"]:
-        """Return where an orbit of any order is stable."""
-        return np.asarray(self.stable.any(axis=0))
+    approach_speed_nm_per_us: Float[np.ndarray, "orders scenes"]
 
 
 def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | None = None) -> OrbitVerdicts:
@@ -62,15 +54,15 @@ def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | Non
     Roots are searched for at all scenes; only where there is one its orbit is looked at.
 
     Args:
-        scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
+        scenes: a batch of scenes with a law: every parameter has shape (scenes,).
         orders: N.
         report: called with how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scenes have no law.
     """
-    if isinstance(scenes.interaction, Contact):
-        return OrbitVerdicts(**single_contact_orbits(scenes, orders, report=report))
+    impact_law_of(scenes)  # refuses a contact
     seen = sample_driven(scenes)
     names = ("peak_amplitude_nm", "largest_multiplier", "approach_speed_nm_per_us")
 
@@ -189,7 +181,7 @@ class StabilityChart(Result):
     @property
     def any_stable(self) -> Bool[np.ndarray, "rows columns"]:
         """Where an orbit of any order is stable and admissible."""
-        return self._plane(self.verdicts.any_stable()[None])[0]
+        return self.stable.any(axis=0)
 
     @property
     def lowest_stable_order(self) -> Int[np.ndarray, "rows columns"]:
@@ -200,7 +192,7 @@ class StabilityChart(Result):
     @property
     def stable_share(self) -> float:
         """Share of the chart's area with a stable orbit of any order."""
-        return float(self.verdicts.any_stable().mean())
+        return float(self.any_stable.mean())
 
     def points(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Return reduced frequency and drive amplitude of every point, in the order of the verdicts."""
@@ -226,9 +218,8 @@ class StabilityChart(Result):
 
     @property
     def impact_speeds_nm_per_us(self) -> Any:
-        """Approach speeds of the orbits in the output; none of a contact's."""
-        speeds = self.verdicts.approach_speed_nm_per_us
-        return () if speeds is None else speeds
+        """Approach speeds of the orbits in the output."""
+        return self.verdicts.approach_speed_nm_per_us
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:
         return rows.reshape(len(rows), len(self.y_values), len(self.x_values))
@@ -248,8 +239,6 @@ def _(chart: StabilityChart) -> dict[str, Any]:
         "any_stable_share": chart.stable_share,
         "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
     }
-    if verdicts.unresolved is not None:
-        told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
     if chart.probability is not None:
         told["uncertain_share"] = ((chart.probability > 0.0) & (chart.probability < 1.0)).mean(axis=1)
     return told
@@ -272,7 +261,7 @@ def _(chart: StabilityChart) -> CsvColumns:
     x, y = ("x" if chart.x is None else chart.x.path, "y" if chart.y is None else chart.y.path)
     columns: dict[str, Any] = dict(zip((x, y), chart.points(), strict=True))
     columns["lowest_stable_order"] = chart.lowest_stable_order.ravel()
-    names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
+    names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier")
     arrays = {name: getattr(chart.verdicts, name) for name in names} | {"stable_probability": chart.probability}
     for order in range(chart.orders):
         columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
@@ -301,7 +290,7 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if `scene_of` gives something else than a scene.
+        TypeError: if `scene_of` gives something else than a scene with a law.
         ValueError: if the scenes do not repeat with one drive period, the values do not rise, or there is no order to
             look for.
     """

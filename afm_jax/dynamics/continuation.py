@@ -74,8 +74,6 @@ class Continuation(ResultTuple):
     branches: tuple[OrbitBranch, ...]
     special: tuple[SpecialPoint, ...]
     curves: tuple[SpecialCurve, ...]
-    rejected: int
-    """Orbits found to begin with whose flights pass through the surface; not followed."""
     family: LawLoops | ContactLoops
     law_parameters: tuple[str, ...] | None = None
     """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
@@ -93,8 +91,6 @@ class Continuation(ResultTuple):
         what = f"orbit of {counted(self.impacts, 'impact')} in {order} drive periods"
         if self.impacts == 0:
             return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
-        if self.rejected:
-            return f"in every {what} {where} the tip would have to pass through the platform; try another order"
         return f"no {what} was found {where}, but a search may miss some; try another order or range"
 
     @property
@@ -240,7 +236,7 @@ def continue_orbits(
             raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
     kind = ContactLoops if isinstance(scene.interaction, Contact) else LawLoops
     family = kind.of(scene, order, ranges[:1])
-    starts, rejected = _orbits_in_range(family, impacts, given)
+    starts = _orbits_in_range(family, impacts, given)
     speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
     family = replace(family, speed_unit=jnp.asarray(speed_unit))
     followed: list[FollowedCurve] = []
@@ -258,7 +254,7 @@ def continue_orbits(
     if second is not None:
         both = replace(kind.of(scene, order, ranges), speed_unit=family.speed_unit)
         curves = special_curves(special, both, second, parameter_values(scene)[second.path])
-    return Continuation(order, impacts, given, second, branches, special, curves, rejected, family)
+    return Continuation(order, impacts, given, second, branches, special, curves, family)
 
 
 def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRange]) -> None:
@@ -281,28 +277,19 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 raise ValueError(f"{given}: {problem}{hint}") from None
 
 
-def _orbits_in_range(
-    family: LoopFamily, impacts: int, given: ParameterRange
-) -> tuple[list[tuple[float, np.ndarray]], int]:
-    """Return orbits at some values in the range, and how many were left out as not admissible.
-
-    Each as the fraction of the range at which it is, and its loop in rad and nm/us.
-    """
-    value = parameter_values(family.scene)[given.path]
+def _orbits_in_range(family: LoopFamily, impacts: int, given: ParameterRange) -> list[tuple[float, np.ndarray]]:
+    """Return orbits at some values in the range: the fraction of the range, and the loop in rad and nm/us."""
+    value, width = parameter_values(family.scene)[given.path], given.high - given.low
     few = impacts > 1 or isinstance(family, ContactLoops)
     tried = np.linspace(0.0, 1.0, (3 if few else 9) + 2)[1:-1]
     # the middle first
     fractions = tried[np.argsort(np.abs(tried - 0.5), kind="stable")].tolist()
     if given.low <= value <= given.high:
-        fractions = [(value - given.low) / (given.high - given.low), *fractions]
+        fractions = [(value - given.low) / width, *fractions]
     if impacts == 0:
-        return [(fractions[0], np.zeros(0))], 0
-    orbits, rejected = [], 0
-    for fraction in fractions:
-        loops, passing = family.found(np.array([given.low + (given.high - given.low) * fraction]), impacts)
-        orbits += [(fraction, loop) for loop in loops]
-        rejected += passing
-    return orbits, rejected
+        return [(fractions[0], np.zeros(0))]
+    found = ((fraction, family.found(np.array([given.low + width * fraction]), impacts)) for fraction in fractions)
+    return [(fraction, loop) for fraction, loops in found for loop in loops]
 
 
 def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:

@@ -125,20 +125,20 @@ def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray,
 class LawLoops(LoopFamily):
     """Loops of a scene with a law, all of whose flights are closed forms."""
 
-    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
-        """Return loops of m impacts in rad and nm/us, and how many closed but do not fly; see `LoopFamily`."""
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> Float[np.ndarray, "loops n"]:
+        """Return loops of m impacts in rad and nm/us; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
         several = any(
             part is not None and part.second is not None for part in (scene.platform, scene.base, scene.force)
         )
         if impacts > 1 or several:
-            return many_impact_orbits(scene, order, impacts).loops, 0
+            return many_impact_orbits(scene, order, impacts).loops
         # all of them, close to capture too, where no start of a search stays
         orbits = single_impact_orbits(scene, order)
         admissible = np.asarray(orbits.exists & orbits.admissible)
         phases = np.asarray(orbits.phase_rad) - drive_of(scene).angular_frequency * np.asarray(orbits.delay_us)
         coordinates = np.asarray(impact_law_of(scene).coordinate(orbits.approach_speed_nm_per_us))
-        return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(orbits.exists) - admissible.sum())
+        return np.stack([phases, coordinates], axis=1)[admissible]
 
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
         """Return the closing conditions and the wanted test function at a point of a curve."""

@@ -44,11 +44,6 @@ class Newton(NamedTuple):
         return step, abs(step if self.unit is None else step / self.unit(x))
 
 
-def shortened(step: Any, longest: Any) -> Any:
-    """Return a step in its own direction, at most so long that every component is within `longest`."""
-    return step / abs(step / longest).max(axis=-1, keepdims=True).clip(1.0)
-
-
 class Root(NamedTuple):
     """Where a search inside a program ended."""
 

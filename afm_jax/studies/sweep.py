@@ -32,7 +32,6 @@ from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
 from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import DRIVEN_NUMBERS, ORBIT_NUMBERS, highest_orbits
-from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
@@ -284,10 +283,10 @@ def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callabl
     return work
 
 
-def _orbits(
-    scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], accuracy: float = CHART_ACCURACY
-) -> Recorder:
+def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], **_: float) -> Recorder:
     """Record the stable single-impact orbits of scenes; of several of one order the highest."""
+    if isinstance(scene.interaction, Contact):
+        raise ValueError("'orbits' are those of laws: `afm-jax collide --make-law` gives that of a contact")  # noqa: TRY004
     sample_driven(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
@@ -296,10 +295,6 @@ def _orbits(
             # a little aside: says why not, where another part has the same frequency
             sample_driven(scene_batch(scene, {path: np.array([1.001 * parameter_values(scene)[path]])}))
     extra = {"order": orders}
-    if isinstance(scene.interaction, Contact):
-        record = partial(_contact_orbits, scene, orders, accuracy)
-        return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
-
     made = _scenes(scene, paths)
 
     def record_batch(columns: Columns) -> Columns:
@@ -315,20 +310,6 @@ def _orbits(
     return Recorder(_in_batches(record_batch), points, ("peak_amplitude_nm", "stable_orbits"), extra)
 
 
-def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row: dict[str, float]) -> dict[str, Any]:
-    """Return what is recorded of the single-impact orbits of one resolved contact."""
-    try:
-        one = scene_batch(scene, {name: np.array([value]) for name, value in row.items()})
-        found = single_contact_orbits(one, orders, accuracy=accuracy)
-    except ValueError as error:
-        nothing, no = np.full(len(orders), math.nan), np.zeros(len(orders), bool)
-        return dict.fromkeys(_CONTACT_NUMBERS, nothing) | dict.fromkeys(_CONTACT_TRUTHS, no) | {MESSAGE: f"{error}"}
-    return {name: found[name][:, 0] for name in _CONTACT_NUMBERS + _CONTACT_TRUTHS} | {MESSAGE: ""}
-
-
-_CONTACT_NUMBERS = ("peak_amplitude_nm", "largest_multiplier")
-_CONTACT_TRUTHS = ("stable", "admissible", "unresolved")
-"""Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
 _COLLISION_NUMBERS = (
     "rebound_speed_nm_per_us",
     "collision_delay_us",
