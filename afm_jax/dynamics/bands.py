@@ -123,8 +123,7 @@ def drawn_exponents(
     uncertain: UncertainParameters,
     *,
     draws: int,
-    impacts: int,
-    transient: int,
+    **lengths: int,
 ) -> Float[np.ndarray, "values 2"]:
     """Return the interval that holds 95 % of the larger exponents per impact of drawn scenes; NaN where unknown.
 
@@ -133,26 +132,18 @@ def drawn_exponents(
         given: values of a parameter by its path, or nothing.
         uncertain: what is drawn.
         draws: how many.
-        impacts: of `lyapunov_spectrum`.
-        transient: of `lyapunov_spectrum`.
+        lengths: `impacts` and `transient` of `lyapunov_spectrum`.
     """
     larger = []
     for drawn in uncertain.without(*given).scenes(scene, draws):
         motions = scene_batch(drawn, given) if given else drawn
-        found = lyapunov_spectrum(motions, impacts=impacts, transient=transient)
+        found = lyapunov_spectrum(motions, **lengths)
         larger.append(np.atleast_2d(found.exponents_per_impact)[:, 0])
     return np.quantile(larger, _BETWEEN, axis=0, method="nearest").T
 
 
 def verdict_probability(
-    scene: Scene,
-    parameter: str,
-    sweep: BifurcationDiagram,
-    uncertain: UncertainParameters,
-    *,
-    start: tuple[float, float, float] | None = None,
-    draws: int,
-    impacts: int,
+    scene: Scene, parameter: str, sweep: BifurcationDiagram, uncertain: UncertainParameters, *, draws: int, **how: Any
 ) -> Float[np.ndarray, " values"]:
     """Return the fraction of drawn scenes whose sweep comes to the same verdict, at each value.
 
@@ -161,13 +152,12 @@ def verdict_probability(
         parameter: that is swept.
         sweep: of the scene.
         uncertain: what is drawn.
-        start: of the sweeps, as of `bifurcation_diagram`.
         draws: how many.
-        impacts: at each value.
+        how: `start` and `impacts` of `bifurcation_diagram`.
     """
     names, same = np.array(sweep.verdicts.names()), []
     for drawn in uncertain.without(parameter).scenes(scene, draws):
-        other = bifurcation_diagram(drawn, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
+        other = bifurcation_diagram(drawn, parameter, sweep.values, upward=sweep.upward, **how)
         same.append(names == np.array(other.verdicts.names()))
     return np.mean(same, axis=0)
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import CsvColumns, columns_of, csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Tips, recorded
 from afm_jax.dynamics.starts import evenly_spread, sample_driven, tips_at
@@ -129,24 +129,11 @@ def _(result: Basins) -> list[Section]:
 
 @csv_columns.register
 def _(result: Basins) -> CsvColumns:
-    # a row a start, and a row an impact of an attractor
+    # a row a start
     names = np.array([attractor.name for attractor in result.attractors])
     phase, speed = np.meshgrid(result.phase_rad, result.rebound_speed_nm_per_us)
-    starts = {
-        "phase_rad": phase.ravel(),
-        "rebound_speed_nm_per_us": speed.ravel(),
-        "attractor": names[result.attractor.ravel()],
-    }
-    points = [
-        {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
-        | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
-        for row in as_json(result)["attractors"]
-        # an attractor without an impact has a row, too
-        for phase, velocity in zip(
-            row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
-        )
-    ]
-    return {"basins.csv": starts, "attractors.csv": columns_of(points)}
+    columns = {"phase_rad": phase, "rebound_speed_nm_per_us": speed, "attractor": names[result.attractor]}
+    return {"basins.csv": {name: column.ravel() for name, column in columns.items()}}
 
 
 @checked

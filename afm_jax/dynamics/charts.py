@@ -5,7 +5,7 @@ judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 a
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -189,11 +189,6 @@ class StabilityChart(Result):
         stable = self.stable
         return np.where(stable.any(axis=0), stable.argmax(axis=0) + 1, 0)
 
-    @property
-    def stable_share(self) -> float:
-        """Share of the chart's area with a stable orbit of any order."""
-        return float(self.any_stable.mean())
-
     def points(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Return reduced frequency and drive amplitude of every point, in the order of the verdicts."""
         frequency, amplitude = np.meshgrid(self.x_values, self.y_values)
@@ -227,16 +222,18 @@ class StabilityChart(Result):
 
 @as_json.register
 def _(chart: StabilityChart) -> dict[str, Any]:
-    verdicts, told = chart.verdicts, {}
-    for axis, given in (("x", chart.x), ("y", chart.y)):
-        if given is not None:
-            told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+    verdicts, axes = chart.verdicts, {"x": chart.x, "y": chart.y}
+    told: dict[str, Any] = {
+        axis: {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+        for axis, given in axes.items()
+        if given is not None
+    }
     told |= {
         "orders": list(range(1, chart.orders + 1)),
         "points": verdicts.stable.shape[1],
         "admissible_share": verdicts.admissible.mean(axis=1),
         "stable_share": verdicts.stable.mean(axis=1),
-        "any_stable_share": chart.stable_share,
+        "any_stable_share": float(chart.any_stable.mean()),
         "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
     }
     if chart.probability is not None:
@@ -296,22 +293,22 @@ def stability_chart(
     """
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
+    across, up = None, None
     if isinstance(scene_of, Scene):
         across, up = (
             parse_range(given if isinstance(given, ParameterRange) else str(given), counted=True)
             for given in (x_values, y_values)
         )
         check_ranges(scene_of, across, up)
-        values = {"x_values": across.values, "y_values": up.values}
-        family = scene_family(scene_of, across.path, up.path)
-        return replace(stability_chart(family, **values, last_order=last_order, report=report), x=across, y=up)
+        x_values, y_values = across.values, up.values
+        scene_of = scene_family(scene_of, across.path, up.path)
     x, y = (np.asarray(values, float) for values in (x_values, y_values))
     for name, values in (("x_values", x), ("y_values", y)):
         if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):
             raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), range(1, last_order + 1), report=report)
-    return StabilityChart(x, y, verdicts)
+    return StabilityChart(x, y, verdicts, across, up)
 
 
 def stable_probability(

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
@@ -136,7 +137,7 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, 
     return np.concatenate([phases, rebound], axis=1)[(rebound > 0.0).all(axis=1)]
 
 
-def _repetitions(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
+def _repetitions(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
     """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses.
 
     The tips start evenly spread. They are simulated in the frame in which the drive is a platform's: what they come to
@@ -151,15 +152,11 @@ def _repetitions(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
     _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=DEFAULT_ACCURACY)
     turns = record.departure_periods + record.departure_us / period + float(seen.frame.phase_rad) / (2.0 * np.pi)
     rebound = record.velocity_after_nm_per_us - np.asarray(platform.velocity(record.departure_us))
-    guesses = []
-    for lane in range(_STARTS):
-        for begin in range(impacts + 1):
-            window = turns[lane, begin : begin + impacts + 1]
-            # the contacts of a guess may miss N drive periods by this
-            if abs(window[-1] - window[0] - order) < 0.05:
-                phases = 2.0 * np.pi * (window[:-1] - np.floor(window[0]))
-                guesses.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
-    return guesses
+    (times, speeds) = (sliding_window_view(part, impacts + 1, axis=1) for part in (turns, rebound))
+    # the contacts of a guess may miss N drive periods by this
+    near = np.abs(times[..., -1] - times[..., 0] - order) < 0.05
+    phases = 2.0 * np.pi * (times[near] - np.floor(times[near][:, :1]))
+    return np.concatenate([phases[:, :-1], speeds[near][:, :-1]], axis=1)
 
 
 class ContactLoops(LoopFamily):
@@ -209,7 +206,7 @@ class ContactLoops(LoopFamily):
     def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> Float[np.ndarray, "loops n"]:
         """Return loops of m contacts in rad and nm/us, each once; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
-        guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts)]
+        guesses = np.concatenate([_orbits_of_law(scene, order, impacts), _repetitions(scene, order, impacts)])
 
         def units(loops: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
             """Return 1 rad for phases and the fastest speed for speeds."""
@@ -229,7 +226,7 @@ class ContactLoops(LoopFamily):
             return LinearisedRows(residual / units(loops), slopes / units(loops)[:, :, None])
 
         closing = Newton(rounds=25, step_tolerance=1e-10, residual_tolerance=1e-10, unit=units, damping=damped)
-        roots = newton_rows(linearised, np.array(guesses).reshape(-1, 2 * impacts), closing)
+        roots = newton_rows(linearised, guesses, closing)
         return loops_told_apart(roots.x[roots.converged], order)
 
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt | None:

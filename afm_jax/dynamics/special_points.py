@@ -25,8 +25,6 @@ class SpecialPoint(NamedTuple):
     parameter: float
     branch: int
     """Number of the branch that it lies on."""
-    position: float
-    """Where on it, in points: 2.5 is between the third and the fourth."""
     admissible: bool
     """Whether the map flies the orbit (at a grazing and a capture: on one side)."""
     point: Float[np.ndarray, " n"]
@@ -87,7 +85,7 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
             continue
         at = root.point.point
         parameter = low + width * float(at[-1])
-        point = SpecialPoint(kind, parameter, number, root.position, admissible, at, reading, root.test)
+        point = SpecialPoint(kind, parameter, number, admissible, at, reading, root.test)
         # of the range
         near = special and abs(special[-1].parameter - parameter) < 1e-7 * width
         if near and special[-1].kind == kind:
@@ -107,12 +105,8 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
             if root is None:
                 continue
             fraction, point = root
-            position = number + fraction
-            if test == CAPTURE:
-                # there the branch ends: its last point is beside it
-                position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
             # of a grazing or a capture the map flies one side alone
-            roots.append(_Root(position, test, point, [each.point for each in (point, leg.begin, leg.end)]))
+            roots.append(_Root(number + fraction, test, point, [each.point for each in (point, leg.begin, leg.end)]))
     return roots
 
 
