@@ -25,7 +25,6 @@ from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
-from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.parameter_paths import scene_family
 
 MASS, PER_KHZ = 16.81, 2e-3 * np.pi
@@ -175,11 +174,6 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit():
     found = swept.phase_rad[0, -1], swept.velocity_after_nm_per_us[0, -1]
     assert found == pytest.approx(place, rel=1e-8)
     assert swept.height_nm[0, -1] == pytest.approx(-5.0, abs=1e-12)
-    period = 2.0 * np.pi / angular_frequency(scene)
-    seen = DensePath(scene, simulate(scene, started(scene, orbits, slot), 3.0 * period)).flying_at(2.0 * period)
-    assert seen is not None
-    heights = swept.strobe_height_nm[0]
-    assert heights[np.isfinite(heights)][-1] == pytest.approx(float(seen.position_nm), abs=1e-6)
     lyapunov = lyapunov_spectrum(scene, impacts=400, transient=400)
     multipliers = multipliers_of(*(np.asarray(part)[[slot]] for part in (orbits.trace, orbits.determinant)))[0]
     assert lyapunov.exponents_per_impact == pytest.approx(np.log(np.abs(multipliers)), abs=1e-8)

@@ -29,7 +29,7 @@ def bifurcation(  # noqa: PLR0913
     it), else leaving the sample upward. Where the sample held it or it flew away it starts again in the same way. The
     output gives the motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last
     impacts. With --out bifurcation.csv (one row per value), impacts.csv (one row per impact; each impact of an orbit
-    once), strobe.csv (heights whenever the platform is highest) and a picture. With --law also the fraction of the
+    once) and a picture. With --law also the fraction of the
     fit's draws with the same motion. Exit code 3 if no motion went on anywhere.
 
     Args:

@@ -95,9 +95,7 @@ def with_errors(found: Continuation, uncertain: UncertainParameters) -> Continua
     for branch in found.branches:
         points = np.column_stack([branch.points, np.tile(others.values, (len(branch.points), 1))])
         amplitudes.append(error(in_blocks(slopes, points, widths=(BLOCK,))))
-    return found._replace(
-        law_parameters=uncertain.paths, special_errors=np.array(special), amplitude_errors=tuple(amplitudes)
-    )
+    return found._replace(special_errors=np.array(special), amplitude_errors=tuple(amplitudes))
 
 
 @jax.jit

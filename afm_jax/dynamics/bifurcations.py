@@ -13,14 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record, Tips
-from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
+from afm_jax.dynamics.many_tips import Tips
+from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Motions, Verdicts, motions_of
 from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
@@ -45,8 +45,6 @@ class BifurcationDiagram(ResultTuple):
         approach_nm_per_us: approach speeds of these impacts.
         velocity_after_nm_per_us: velocities of the tip in the lab after these impacts.
         height_nm: heights of the platform when the tip arrives.
-        strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
-            (values, drive periods), of the last ones.
         verdict_probability: at each value the fraction of drawn laws with this verdict; None: no laws were drawn.
     """
 
@@ -57,7 +55,6 @@ class BifurcationDiagram(ResultTuple):
     approach_nm_per_us: Float[np.ndarray, "values impacts"]
     velocity_after_nm_per_us: Float[np.ndarray, "values impacts"]
     height_nm: Float[np.ndarray, "values impacts"]
-    strobe_height_nm: Float[np.ndarray, "values periods"]
     verdict_probability: Float[np.ndarray, " values"] | None = None
 
     @property
@@ -96,7 +93,7 @@ def _(ramp: BifurcationDiagram) -> list[Section]:
 
 @csv_columns.register
 def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
-    # a row a value, an impact, and a height when the drive's phase is 0
+    # a row a value, and an impact
     verdicts = {"verdict": np.array(ramp.verdicts.names())}
     impacts = {
         "phase_rad": ramp.phase_rad,
@@ -107,7 +104,6 @@ def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
     files = {
         "bifurcation.csv": (verdicts | _probability(ramp), np.ones(len(ramp.values), bool)),
         "impacts.csv": (impacts, np.isfinite(ramp.phase_rad)),
-        "strobe.csv": ({"height_nm": ramp.strobe_height_nm}, np.isfinite(ramp.strobe_height_nm)),
     }
     return {
         file: {
@@ -228,7 +224,6 @@ def bifurcation_diagram(
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(record.velocity_after_nm_per_us + seen.response(record.departure_us)[1]),
         height_nm=known(offset + amplitude * np.cos(omega * record.arrival_us + ahead)),
-        strobe_height_nm=_strobes(seen, record, shown),
     )
 
 
@@ -305,27 +300,3 @@ def _same(one: Motions, other: Motions) -> Bool[np.ndarray, " lanes"]:
     # of the largest speed
     near = np.abs(speeds - others).max(axis=1) <= 1e-4 * np.maximum(others[:, -1], 1e-12)
     return same & (near | (a.kind != MotionKind.ORBIT))
-
-
-def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray) -> Float[np.ndarray, "values heights"]:
-    """Return the tip's heights whenever the drive's phase is 0: with a moving platform, whenever it is highest."""
-    # of the last 48 flights, and 8 heights at most in a flight
-    period, some = np.asarray(seen.scenes.platform.period_us), slice(-49, None)
-    # in periods of the scene's own clock
-    ahead = np.asarray(seen.frame.phase_rad)[:, None] / (2.0 * np.pi)
-    begin = record.turns(period)[:, some][:, :-1] + ahead
-    end = (record.arrival_periods + record.arrival_us / period[:, None])[:, some][:, 1:] + ahead
-    strobe = np.ceil(begin)[..., None] + np.arange(8)
-    flown = np.nan_to_num((strobe - begin[..., None]) * period[:, None, None])
-    departure, velocity = (
-        part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)
-    )
-
-    def height_of(scene: Scene, departure: Any, velocity: Any, flown: Any) -> Array:
-        start = scene.platform.position(departure) + gap_of_departure(scene)
-        return scene.cantilever.propagator(flown)(start, velocity)[0]
-
-    height = jax.vmap(height_of)(seen.scenes, departure, velocity, flown)
-    height = np.asarray(height + seen.response(-ahead * period[:, None])[0][..., None])
-    inside = shown[:, some][:, 1:, None] & (strobe < end[..., None])
-    return np.where(inside, height, np.nan).reshape(len(period), -1)

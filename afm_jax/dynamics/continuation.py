@@ -20,7 +20,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
 from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on
 from afm_jax.dynamics.impact_loop import CAPTURE, LoopFamily, driven_part
-from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, impact_rows, orbit_facts
+from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, orbit_facts
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
@@ -75,8 +75,6 @@ class Continuation(ResultTuple):
     special: tuple[SpecialPoint, ...]
     curves: tuple[SpecialCurve, ...]
     family: LawLoops | ContactLoops
-    law_parameters: tuple[str, ...] | None = None
-    """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
     amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
     """Standard errors of the peak amplitude, in nm, of each branch."""
     special_errors: Float[np.ndarray, " special"] | None = None
@@ -122,7 +120,6 @@ def _special_rows(result: Continuation) -> list[dict[str, Any]]:
             "branch": point.branch,
             "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
             "admissible": point.admissible,
-            "impacts": impact_rows(point.reading),
         }
         if result.special_errors is not None:
             error = float(result.special_errors[index])
@@ -144,7 +141,6 @@ def _(result: Continuation) -> dict[str, Any]:
         "special": _special_rows(result),
         "curves": [curve._asdict() for curve in result.curves],
         "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in result.branches],
-        "law_parameters": result.law_parameters,
     }
 
 

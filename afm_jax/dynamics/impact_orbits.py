@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.columns import rows_of
 from afm_jax.dynamics.impact_loop import (
     CAPTURE,
     ImpactLoop,
@@ -95,7 +96,7 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
     """Return the row of an orbit of several impacts: the numbers of the first, and all of them in `impacts`."""
     trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
     multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
-    impacts = impact_rows(reading, index)
+    impacts = rows_of({name: getattr(reading, name)[index] for name in IMPACT_COLUMNS})
     first = impacts[0] if impacts else dict.fromkeys(IMPACT_COLUMNS)
     return {
         "phase_rad": first["phase_rad"],
@@ -108,13 +109,6 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
         "admissible": bool(reading.admissible[index]),
         "impacts": impacts,
     }
-
-
-def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
-    """Return the rows of the impacts of an orbit, one or several."""
-    columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
-    lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
-    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
 def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:
