@@ -180,10 +180,8 @@ def basins_of_attraction(
         finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
-    order = [number for number in np.argsort(-count, kind="stable") if count[number]]
-    place = np.full(len(count), -1)
-    place[order] = np.arange(len(order))
-    label = place[label].reshape(rows, columns)
+    rank = np.argsort(-count, kind="stable")
+    label, order = np.argsort(rank)[label].reshape(rows, columns), rank[count[rank] > 0]
     share = count[order] / label.size
 
     def in_lab(attractor: Attractor) -> Attractor:

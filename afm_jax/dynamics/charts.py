@@ -331,11 +331,7 @@ def stable_probability(
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:
     """Return one scene a row of some columns of arguments, as a batch."""
-
-    def made(*values: Array) -> Scene:
-        scene = scene_of(*values)
-        check_kind("scene_of(...)", scene, Scene)
-        return scene
-
     # operation by operation, which JAX knows again: a program of a new function would be compiled at every call
-    return eqx.filter_vmap(made)(*(jnp.asarray(column, float) for column in columns))
+    scenes = eqx.filter_vmap(scene_of)(*(jnp.asarray(column, float) for column in columns))
+    check_kind("scene_of(...)", scenes, Scene)
+    return scenes

@@ -104,8 +104,7 @@ def _point_rows(result: Continuation) -> list[dict[str, Any]]:
         for index, value in enumerate(branch.parameter.tolist()):
             row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
             if result.amplitude_errors is not None:
-                error = float(result.amplitude_errors[number][index])
-                row["peak_amplitude_error_nm"] = error if np.isfinite(error) else None
+                row["peak_amplitude_error_nm"] = float(result.amplitude_errors[number][index])
             rows.append(row)
     return rows
 

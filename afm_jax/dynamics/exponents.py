@@ -19,7 +19,7 @@ from afm_jax.checks import checked
 from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import multipliers_of
-from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, Record, Tips, follow, next_departures
+from afm_jax.dynamics.many_tips import Record, Tips, follow, next_departures
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
@@ -105,11 +105,8 @@ def _(result: Lyapunov) -> list[Section]:
     # the exponents of one motion with their errors; of many how many are positive
     larger, error = result.exponents_per_impact[..., 0], result.exponents_per_impact_error[..., 0]
     if np.ndim(result.impacts):
-        positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
-        unknown = int(np.sum(np.isnan(larger)))
-        what, others = result.along or counted(larger.size, "motion"), larger.size - unknown - positive
-        verdict = f"negative or undecided at {others}, unknown at {unknown}"
-        return [Section("", [f"{what}: the larger exponent is positive at {positive} values, {verdict}"])]
+        positive, what = int(np.sum(larger > CHAOTIC_ERRORS * error)), result.along or counted(larger.size, "motion")
+        return [Section("", [f"{what}: the larger exponent is positive at {positive} of {larger.size} values"])]
 
     def pair(values: np.ndarray, errors: np.ndarray) -> str:
         pairs = zip(values, errors, strict=True)
@@ -199,7 +196,7 @@ def lyapunov_spectrum(
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency; or a batch of scenes.
-        start: where the motion begins; None: one scene's default, of many `bouncing_tips`.
+        start: where the motion begins; None: `bouncing_tips`.
         impacts: impacts over which the exponents are taken.
         transient: impacts before.
         accuracy: of resolved contacts, as for `simulate`.
@@ -330,18 +327,14 @@ def _contact_jacobians(
     accuracy: float,
 ) -> Float[np.ndarray, "lanes steps 2 2"]:
     """Return the derivatives of next departures, d(phase, rebound speed) over d(phase, rebound speed) of these."""
-    column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], scenes)
-    omega = column.platform.angular_frequency
+    each = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+    omega, time = np.asarray(each.platform.angular_frequency), departure_us.ravel()
+    rebound = velocity_nm_per_us.ravel() - np.asarray(each.platform.velocity(time))
     # a thousandth of a free period after a departure no contact goes on, and the next one has not begun
-    until = next_departure_us + 1.0 / column.cantilever.frequency_khz
-    rebound = velocity_nm_per_us - column.platform.velocity(departure_us)
-    departures = jnp.stack([omega * departure_us, rebound], axis=-1).reshape(-1, 2)
-    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+    until = omega * (next_departure_us.ravel() + 1.0 / each.cantilever.frequency_khz)
 
-    def work(lanes: tuple[Scene, Array, Array]) -> Array:
-        return next_departures(*lanes, accuracy=accuracy)[1]
-
-    slopes = in_blocks(work, (of_all, departures, (omega * until).ravel()), block=CONTACTS_AT_ONCE)
+    lanes = each, np.stack([omega * time, rebound], axis=1), until
+    slopes = in_blocks(lambda some: next_departures(*some, accuracy=accuracy)[1], lanes, widths=WIDTHS[:-1])
     return slopes.reshape(*departure_us.shape, 2, 2)
 
 

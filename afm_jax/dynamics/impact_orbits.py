@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
-from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.columns import rows_of
 from afm_jax.dynamics.impact_loop import (
     CAPTURE,
@@ -211,14 +211,13 @@ def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
 
 
 @checked
-def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 512) -> ManyImpactOrbits:
-    """Return the orbits of m impacts in N drive periods that a search from many starts finds.
+def many_impact_orbits(scene: Scene, order: int, impacts: int) -> ManyImpactOrbits:
+    """Return the orbits of m impacts in N drive periods that a search from 512 starts finds.
 
     Args:
         scene: one scene with an `ImpactLaw`, driven with one period.
         order: N, drive periods until the motion repeats.
         impacts: m, impacts in them.
-        starts: how many flights the search begins with; more find more of the unstable orbits of a chaotic scene.
 
     Returns:
         The orbits, closed to 1e-11 of their speeds or better. Stable ones are found surely enough; of unstable ones
@@ -233,10 +232,9 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     require_float64(scene)
     impact_law_of(scene)
     check_loop(order, impacts)
-    check_count("starts", starts)
     top_speed = surface_of(scene)[0].top_speed_nm_per_us
     family = replace(LawLoops.of(scene, order), speed_unit=top_speed)
-    unknowns, closed = _search(family, jnp.asarray((0.5 + evenly_spread(starts)) % 1.0), impacts=int(impacts))
+    unknowns, closed = _search(family, jnp.asarray((0.5 + evenly_spread(512)) % 1.0), impacts=int(impacts))
     loops = loops_told_apart(np.asarray(unknowns)[np.asarray(closed)], order)
     reading = family.readings(loops)
     fly = reading.admissible & (reading.missing < _CLOSED)

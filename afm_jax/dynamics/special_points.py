@@ -152,11 +152,10 @@ def special_curves(
     followed: list[tuple[int, FollowedCurve]] = []
     curves = []
     for point in special:
-        if not point.admissible:
-            continue
         start = np.append(point.point, (value - second.low) / (second.high - second.low))
         with_test = replace(family, test=point.test)
-        if any(lies_on(start, curve, with_test) for test, curve in followed if test == point.test):
+        others = (curve for test, curve in followed if test == point.test)
+        if not point.admissible or any(lies_on(start, curve, with_test) for curve in others):
             continue
         curve = followed_both_ways(start, with_test)
         if curve is not None:

@@ -22,7 +22,7 @@ from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start, gap_of_departure, rebound_of_leaving
+from afm_jax.motion.start import gap_of_departure, rebound_of_leaving
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import WIDTHS, in_blocks
 
@@ -85,13 +85,12 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
 
     Args:
         scene: one scene, or a batch of scenes.
-        start: the tip in the lab; None: `default_start` of one scene, of many `bouncing_tips`.
+        start: the tip in the lab; None: `bouncing_tips`.
 
     Raises:
         ValueError: if the tip cannot start there.
     """
     if scene.platform.frequency_khz.ndim == 0:
-        start = default_start(scene) if start is None else start
         scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
     if start is None:
         return scene, bouncing_tips(scene)
