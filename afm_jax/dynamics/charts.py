@@ -62,7 +62,6 @@ def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | Non
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scenes have no law.
     """
-    impact_law_of(scenes)  # refuses a contact
     seen = sample_driven(scenes)
     names = ("peak_amplitude_nm", "largest_multiplier", "approach_speed_nm_per_us")
 
