@@ -121,7 +121,7 @@ def drawn_exponents(
     uncertain: UncertainParameters,
     *,
     draws: int,
-    **lengths: int,
+    **lengths: Any,
 ) -> Float[np.ndarray, "values 2"]:
     """Return the interval that holds 95 % of the larger exponents per impact of drawn scenes; NaN where unknown.
 

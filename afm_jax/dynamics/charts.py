@@ -180,7 +180,7 @@ class StabilityChart(Result):
     @property
     def any_stable(self) -> Bool[np.ndarray, "rows columns"]:
         """Where an orbit of any order is stable and admissible."""
-        return self.stable.any(axis=0)
+        return np.asarray(self.stable.any(axis=0))
 
     @property
     def lowest_stable_order(self) -> Int[np.ndarray, "rows columns"]:
