@@ -327,7 +327,7 @@ def _contact_jacobians(
     accuracy: float,
 ) -> Float[np.ndarray, "lanes steps 2 2"]:
     """Return the derivatives of next departures, d(phase, rebound speed) over d(phase, rebound speed) of these."""
-    each = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+    each = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), departure_us.shape[1], axis=0), scenes)
     omega, time = np.asarray(each.platform.angular_frequency), departure_us.ravel()
     rebound = velocity_nm_per_us.ravel() - np.asarray(each.platform.velocity(time))
     # a thousandth of a free period after a departure no contact goes on, and the next one has not begun
