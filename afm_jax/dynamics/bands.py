@@ -82,20 +82,19 @@ def with_errors(found: Continuation, uncertain: UncertainParameters) -> Continua
     low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
     family = replace(family, low=low, width=width, paths=(found.range.path, *others.paths))
 
-    def error(slopes: Float[np.ndarray, "... uncertain"]) -> Float[np.ndarray, "..."]:
-        return np.sqrt(np.einsum("...i,ij,...j->...", slopes, others.covariance, slopes))
+    def errors(slopes: Float[np.ndarray, "points uncertain"]) -> Float[np.ndarray, " points"]:
+        return np.sqrt(np.einsum("ni,ij,nj->n", slopes, others.covariance, slopes))
 
-    special = []
-    for point in found.special:
+    special = np.zeros((len(found.special), len(others.paths)))
+    for number, point in enumerate(found.special):
         at = jnp.asarray(np.append(point.point, others.values))
-        by_uncertain, _ = _slopes_at(replace(family, test=point.test), at)
-        special.append(float(family.width[0]) * error(np.asarray(by_uncertain)[-1]))
+        special[number] = float(family.width[0]) * _slopes_at(replace(family, test=point.test), at)[0][-1]
     slopes = jax.jit(jax.vmap(lambda point: _slopes_at(family, point)[1]))
     amplitudes = []
     for branch in found.branches:
         points = np.column_stack([branch.points, np.tile(others.values, (len(branch.points), 1))])
-        amplitudes.append(error(in_blocks(slopes, points, widths=(BLOCK,))))
-    return found._replace(special_errors=np.array(special), amplitude_errors=tuple(amplitudes))
+        amplitudes.append(errors(in_blocks(slopes, points, widths=(BLOCK,))))
+    return found._replace(special_errors=errors(special), amplitude_errors=tuple(amplitudes))
 
 
 @jax.jit
