@@ -97,7 +97,7 @@ _EDITS = {
     "test_lasting_fit.py::test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient": {
         "orbits that grow for nothing": "[(share[:, None] * white).ravel(), {over => 0.0 * over}, known]"
     },
-    "test_least_squares.py::test_a_search_alone_ends_where_scipys_does": {
+    "test_least_squares.py::test_searches_end_where_scipys_do": {
         "damped steps uphill": "step[moving] = {- => }np.linalg.solve(normal"
     },
     "test_laws_of_fits.py::test_derivatives_of_formulas_are_those_of_differences[smooth]": {
@@ -195,7 +195,7 @@ _EDITS = {
         "a loop one drive period too short": "arrival[:1] + { => 0.5 * }loop.period_us"
     },
     "test_lyapunov.py::test_the_larger_exponent_is_the_growth_of_neighbouring_motions": {
-        "sum of the exponents with the wrong sign": "np.stack([growth, determinant {- => +} growth]"
+        "sum of the exponents with the wrong sign": "np.log(np.abs(determinants))) {- => +} growth], axis"
     },
     "test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture": {
         "slow rows padded by their difference alone": "0.5 * ({_TOGETHER +  => }_APART",

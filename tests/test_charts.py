@@ -29,7 +29,7 @@ def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float):
     frequency, amplitude = chart.points()
     generator = np.random.default_rng(11)
     # Stable for half of the points, anything for the others; the order nearest to resonance has most to tell.
-    stable = generator.choice(np.flatnonzero(chart.verdicts.any_stable()), 10, replace=False)
+    stable = generator.choice(np.flatnonzero(chart.any_stable), 10, replace=False)
     for point in (*stable, *generator.choice(frequency.size, 10, replace=False)):
         order = int(chart.lowest_stable_order.ravel()[point]) or max(1, round(float(frequency[point])))
         drive: Any = {"amplitude_nm": float(amplitude[point]), "drive_frequency_khz": float(180.0 * frequency[point])}

@@ -8,8 +8,6 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -17,7 +15,6 @@ from scipy.optimize import brentq
 
 from afm_jax import (
     Cantilever,
-    CollisionDelay,
     ForceDrive,
     ImpactLaw,
     Platform,
@@ -26,9 +23,7 @@ from afm_jax import (
     save_scene,
 )
 from afm_jax.cli.main import main
-from afm_jax.dynamics import impact_orbits
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
-from afm_jax.impact.closure import OrbitProblem, closing_residual
 from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
@@ -198,46 +193,6 @@ def test_a_driven_tip_grazes_where_it_must():
     assert only(one, "grazing") == pytest.approx([-size], abs=1e-8)
     (curve,) = (curve for curve in one.curves if curve.kind == "grazing")
     np.testing.assert_allclose(curve.parameter, -size / 0.08 * curve.second, atol=1e-7)
-    assert "grazing_grazing" not in {meeting.kind for meeting in curve.meetings}
-
-
-def flattest(problem: OrbitProblem) -> tuple[float, float]:
-    """Return value and slope of the closing condition of single-impact orbits at its flattest inflection near 0.
-
-    The condition is one equation for the logarithm of the coordinate; all three vanish where three orbits are one.
-    """
-
-    def residual(size: jax.Array) -> jax.Array:
-        return closing_residual(jnp.exp(size), problem)
-
-    slope, lowest = jax.grad(residual), problem.impact.lowest
-    sizes = jnp.linspace(jnp.log(1.02 * lowest), jnp.log(30.0 * lowest), 20001)
-    flat = jnp.abs(jax.vmap(residual)(sizes)) + jnp.abs(jax.vmap(slope)(sizes))
-    place, bend = float(sizes[int(jnp.argmin(flat))]), jax.jit(jax.grad(slope))
-    root = root_of(lambda size: float(bend(jnp.asarray(size))), place - 0.02, place + 0.02)
-    return float(residual(jnp.asarray(root))), float(slope(jnp.asarray(root)))
-
-
-@pytest.mark.slow
-def test_cusps_are_triple_roots_and_curves_meet_in_the_same_points():
-    delayed = ImpactLaw(1.0, 114.6, 0.4994, CollisionDelay(0.20256, 6.458, 0.5634, corrections=False))
-    many = Scene(Cantilever(90.0, 40.0), Platform(2.0, 720.0, 1.0), delayed)
-    second = ParameterRange("platform.amplitude_nm", 2.0, 3.0)
-    found = continue_orbits(many, 4, ParameterRange("platform.reduced_frequency", 3.75, 4.1), second=second)
-    curves = {curve.kind: curve for curve in found.curves}
-    cusps = [one for one in curves["fold"].meetings if one.kind == "cusp"]
-    assert len(cusps) == 2
-    for one in cusps:
-        platform = Platform(one.second, 180.0 * one.parameter, 1.0)
-        value, slope = flattest(OrbitProblem(many.cantilever, platform, delayed, jnp.asarray(4.0)))
-        assert abs(value) < 1e-9
-        assert abs(slope) < 1e-8
-
-    def met(kind: str, name: str) -> tuple[float, float]:
-        (one,) = [one for one in curves[kind].meetings if one.kind == name]
-        return one.parameter, one.second
-
-    assert met("fold", "fold_grazing") == pytest.approx(met("grazing", "grazing_fold"), abs=1e-8)
 
 
 def run(made: Scene, folder: Path, command: str, *arguments: str) -> dict:
@@ -313,30 +268,3 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
     assert "capture" not in ends
     assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)
-
-
-@pytest.fixture
-def feeding(monkeypatch: pytest.MonkeyPatch):
-    """Let every impact feed the motion by a hundredth more than it does: no law of the package does.
-
-    The test with it is the last of the file: what JAX has compiled for the others is forgotten before and after.
-    """
-    true = impact_orbits.trace_and_determinant_of
-
-    def more(*arguments):
-        trace, determinant = true(*arguments)
-        return trace, 1.02 * determinant
-
-    monkeypatch.setattr(impact_orbits, "trace_and_determinant_of", more)
-    jax.clear_caches()
-    yield
-    jax.clear_caches()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("feeding")
-def test_multipliers_cross_the_circle_at_a_torus_point():
-    given = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), ImpactLaw(0.985))
-    # undamped, without adhesion D = r^2
-    found = continue_orbits(given, 1, ParameterRange("interaction.r", 0.98, 0.995))
-    assert only(found, "torus") == pytest.approx([1.0 / np.sqrt(1.02)], abs=1e-8)

@@ -55,13 +55,6 @@ def test_searches_end_where_scipys_do(truth, fixed):
     assert (end.place[1] == HIGHEST[1]) == (truth[1] == 2.0)
 
 
-@pytest.mark.parametrize("truth", TRUTHS)
-def test_a_search_alone_ends_where_scipys_does(truth):
-    end = levenberg_marquardt(at(truth), START, settled=1e-16, most=100)
-    scipy = least_squares(residual, START, args=(truth,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    np.testing.assert_allclose(end.place, scipy.x, rtol=1e-6, atol=1e-6)
-
-
 def test_covariances_are_inverses_where_there_are_some():
     random = np.random.default_rng(3)
     factor = random.normal(size=(5, 4, 3)) * [1e-8, 1.0, 1e6]

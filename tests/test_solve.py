@@ -24,7 +24,7 @@ def test_many_lanes_are_worked_on_in_blocks_of_one_size(count: int, sizes: set[i
         return {"sum": lanes["x"] + lanes["y"].sum(axis=1), "x64": jnp.asarray(1.0) * lanes["x"]}
 
     lanes = {"x": VALUES[:count], "y": np.ones((count, 3))}
-    found = in_blocks(work, lanes, block=16, widths=(1, 8), report=lambda done, of: told.append((done, of)))
+    found = in_blocks(work, lanes, widths=(1, 8, 16), report=lambda done, of: told.append((done, of)))
     np.testing.assert_array_equal(found["sum"], VALUES[:count] + 3.0)
     assert found["x64"].dtype == np.float64
     assert set(seen) == sizes
@@ -170,15 +170,12 @@ def circle(point: np.ndarray) -> EquationsAt | None:
     return None if abs(x) > 3.0 else EquationsAt(np.array([x * x + y * y - 4.0]), np.array([[2.0 * x, 2.0 * y]]), x)
 
 
-IN_PLANE = Newton(rounds=12, step_tolerance=1e-9)
-
-
 def test_a_curve_is_followed_round_its_fold():
     here, tangent = np.array([2.0, 0.0]), np.array([0.0, 1.0])
     length = 0.3
     turned = 0.0
     while turned < 2.0 * np.pi:
-        step = point_in_plane(circle, here + length * tangent, tangent, IN_PLANE)
+        step = point_in_plane(circle, here + length * tangent, tangent)
         assert step is not None
         assert step.x @ step.x == pytest.approx(4.0, rel=1e-14)
         # in the plane through the guess, at the angle whose tangent is length over radius

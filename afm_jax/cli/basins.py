@@ -25,7 +25,7 @@ def basins(
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
     speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, irregular, stuck or
     free. The output gives the fraction of the starts that end on each, with the errors of as many random starts. With
-    --law fractions have a band from drawn laws. With --out basins.csv (a row a start), attractors.csv and a picture.
+    --law fractions have a band from drawn laws. With --out basins.csv (a row a start) and a picture.
     Exit code 3 if starts could not be followed.
 
     Args:

@@ -29,11 +29,11 @@ def bifurcation(  # noqa: PLR0913
     it), else leaving the sample upward. Where the sample held it or it flew away it starts again in the same way. The
     output gives the motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last
     impacts. With --out bifurcation.csv (one row per value), impacts.csv (one row per impact; each impact of an orbit
-    once), strobe.csv (heights whenever the platform is highest) and a picture. With --law also the fraction of the
+    once) and a picture. With --law also the fraction of the
     fit's draws with the same motion. Exit code 3 if no motion went on anywhere.
 
     Args:
-        session: for progress and messages.
+        session: for progress.
         scene: the scene.
         parameter: a parameter of the scene file and its values.
         both: ramp up and then down, so that hysteresis shows.
@@ -55,7 +55,5 @@ def bifurcation(  # noqa: PLR0913
             for number, sweep in enumerate(sweeps):
                 share = verdict_probability(scene.scene, swept.path, sweep, scene.unknowns, draws=draws, **how)
                 sweeps[number] = sweep._replace(verdict_probability=share)
-    if not all(sweep.complete for sweep in sweeps):
-        session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)
     return Output.of(ramps, files={"bifurcation.png": picture_of("dynamics:bifurcation_figure", ramps, ordinate)})

@@ -6,7 +6,7 @@ from typing import Annotated
 from click import IntRange
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.scenes import NamedScene, ranges_of
+from afm_jax.cli.scenes import NamedScene, ranges_of, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.dynamics.charts import stability_chart, stable_probability
 
@@ -25,10 +25,9 @@ def chart(
     """Chart the single-impact orbits that exist, are stable and coexist, over two parameters of a scene.
 
     The output says for every point and order whether an orbit is admissible and whether one is stable. For the stable
-    one (the highest, if there are several) it gives the peak amplitude and the size of the larger multiplier. Orbits of
-    a contact are closed by simulation, from those of the law closest to it: chart a thousand points, not a million. A
-    point is unresolved where none closes. With --law also the fraction of the fit's draws in which an orbit is stable.
-    With --out chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
+    one (the highest, if there are several) it gives the peak amplitude and the size of the larger multiplier. With
+    --law also the fraction of the fit's draws in which an orbit is stable. With --out chart.csv and a picture. Exit
+    code 3 if there is no admissible orbit at all.
 
     Args:
         session: for progress.
@@ -38,6 +37,7 @@ def chart(
         orders: highest order N.
         draws: laws drawn from the fit for the bands.
     """
+    refuse_other_than_law(scene)
     across, up = ranges_of(scene, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")

@@ -8,7 +8,7 @@ from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import NamedScene, ranges_of, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.bands import amplitude_errors, special_errors
+from afm_jax.dynamics.bands import with_errors
 from afm_jax.dynamics.continuation import continue_orbits
 
 
@@ -23,10 +23,10 @@ def follow(
 ) -> Output:
     """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
-    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
-    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
-    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a 95 %
-    interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    Folds, period doublings, grazings and captures are located to rounding; with --second they are followed as curves in
+    two parameters. In a scene with a contact the simulation is closed instead of the map, and curves end where the
+    orbit grazes or is captured. With --law every special point has a 95 % interval. With --out tables and pictures.
+    Exit code 3 if there is no admissible orbit in the range.
 
     Args:
         session: for progress.
@@ -41,13 +41,8 @@ def follow(
     first, *others = ranges_of(scene, [parameter, *([second] if second else [])], counted=False)
     with session.working("following orbits (the first run compiles for some seconds)"):
         followed = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
-    uncertain = scene.unknowns
-    if uncertain is not None:
-        followed = followed._replace(
-            law_parameters=uncertain.paths,
-            amplitude_errors=tuple(amplitude_errors(followed, branch, uncertain) for branch in followed.branches),
-            special_errors=special_errors(followed, uncertain),
-        )
+    if scene.unknowns is not None:
+        followed = with_errors(followed, scene.unknowns)
     files = {"branches.png": picture_of("branches:continuation_figure", followed)}
     if followed.curves:
         files["curves.png"] = picture_of("branches:curves_figure", followed)

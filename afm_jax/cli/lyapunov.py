@@ -26,11 +26,10 @@ def lyapunov(
 
     Exponents of a motion that has reached an orbit are the logarithms of its multipliers. A tip that rests on the
     platform forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start];
-    without one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it
-    if it is unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves
-    the sample upward. A motion that stays on an unstable orbit is undecided. With --law the larger exponent has a band,
-    whose motions do not use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every
-    motion ends before enough impacts.
+    without one on a stable single-impact orbit of the order nearest to resonance, else leaving the sample upward. A
+    motion that stays on an unstable orbit is undecided. With --law the larger exponent has a band, whose motions do not
+    use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every motion ends before enough
+    impacts.
 
     Args:
         session: for progress.

@@ -22,7 +22,6 @@ from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_loop import highest_point
 from afm_jax.dynamics.impact_orbits import BLOCK, LawLoops
-from afm_jax.dynamics.special_points import OrbitBranch
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
 
@@ -37,14 +36,16 @@ class UncertainParameters(NamedTuple):
     values: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
 
-    def without(self, path: str) -> "UncertainParameters":
-        """Return the parameters without the one of a path, which is varied and has no error of its own."""
-        kept = [number for number, other in enumerate(self.paths) if other != path]
+    def without(self, *varied: str) -> "UncertainParameters":
+        """Return the parameters without those of some paths, which are varied and have no error of their own."""
+        kept = [number for number, path in enumerate(self.paths) if path not in varied]
         paths = tuple(self.paths[number] for number in kept)
         return UncertainParameters(paths, self.values[kept], self.covariance[np.ix_(kept, kept)])
 
-    def possible_draws(self, number: int) -> Float[np.ndarray, "draws parameters"]:
-        """Return draws from the normal distribution that are physical: r in (0, 1], nothing else below 0.
+    def scenes(self, scene: Scene, number: int) -> Iterator[Scene]:
+        """Give a scene with parameters drawn from the normal distribution, so many times.
+
+        Draws are physical: r in (0, 1], losses and quality factor not below 0.
 
         Raises:
             ValueError: if hardly any can be.
@@ -60,52 +61,40 @@ class UncertainParameters(NamedTuple):
                 good &= column >= 0.0
         if good.sum() < number:
             raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
-        return drawn[good][:number]
-
-    def scenes(self, scene: Scene, number: int) -> Iterator[Scene]:
-        """Give a scene with drawn parameters, so many times."""
         family = scene_family(scene, *self.paths)
-        for values in self.possible_draws(number):
+        for values in drawn[good][:number]:
             yield family(*values)
 
 
-def special_errors(continuation: Continuation, uncertain: UncertainParameters) -> Float[np.ndarray, " special"]:
-    """Return the standard error of the parameter at each special point.
+def with_errors(found: Continuation, uncertain: UncertainParameters) -> Continuation:
+    """Return a continuation with the errors of its special points and of the peak amplitudes along its branches.
+
+    Those of amplitudes hold for a parameter that is held: they grow without bound towards a fold, where the orbit of a
+    held parameter ceases to exist.
 
     Args:
-        continuation: of the scene with the values of the uncertain parameters.
+        found: of the scene with the values of the uncertain parameters.
         uncertain: parameters; if the one that was followed is among them, its own error does not count.
     """
-    uncertain = uncertain.without(continuation.range.path)
-    width, errors = continuation.range.high - continuation.range.low, []
-    for point in continuation.special:
-        at = jnp.asarray(np.append(point.point, uncertain.values))
-        by_uncertain, _ = _slopes_at(_with_uncertain(continuation, uncertain, point.test), at)
-        slope = width * np.asarray(by_uncertain)[-1]
-        errors.append(np.sqrt(slope @ uncertain.covariance @ slope))
-    return np.array(errors)
-
-
-def amplitude_errors(
-    continuation: Continuation, branch: OrbitBranch, uncertain: UncertainParameters
-) -> Float[np.ndarray, " points"]:
-    """Return the standard error of the peak amplitude in nm at each point of a branch, its own parameter held.
-
-    It grows without bound towards a fold, where the orbit of a held parameter ceases to exist.
-    """
-    uncertain = uncertain.without(continuation.range.path)
-    family = _with_uncertain(continuation, uncertain, None)
-    points = np.column_stack([branch.points, np.tile(uncertain.values, (len(branch.points), 1))])
-    slope = in_blocks(lambda block: _amplitude_slopes(family, block), points, block=BLOCK, widths=())
-    return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
-
-
-def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LawLoops:
-    """Return the loops of a continuation with the uncertain parameters behind the followed one."""
-    family: Any = continuation.family
-    zero, unit = jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
+    others = uncertain.without(found.range.path)
+    family: Any = found.family
+    zero, unit = jnp.zeros(len(others.paths)), jnp.ones(len(others.paths))
     low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
-    return replace(family, low=low, width=width, paths=(continuation.range.path, *uncertain.paths), test=test)
+    family = replace(family, low=low, width=width, paths=(found.range.path, *others.paths))
+
+    def errors(slopes: Float[np.ndarray, "points uncertain"]) -> Float[np.ndarray, " points"]:
+        return np.sqrt(np.einsum("ni,ij,nj->n", slopes, others.covariance, slopes))
+
+    special = np.zeros((len(found.special), len(others.paths)))
+    for number, point in enumerate(found.special):
+        at = jnp.asarray(np.append(point.point, others.values))
+        special[number] = float(family.width[0]) * _slopes_at(replace(family, test=point.test), at)[0][-1]
+    slopes = jax.jit(jax.vmap(lambda point: _slopes_at(family, point)[1]))
+    amplitudes = []
+    for branch in found.branches:
+        points = np.column_stack([branch.points, np.tile(others.values, (len(branch.points), 1))])
+        amplitudes.append(errors(in_blocks(slopes, points, widths=(BLOCK,))))
+    return found._replace(special_errors=errors(special), amplitude_errors=tuple(amplitudes))
 
 
 @jax.jit
@@ -125,19 +114,13 @@ def _slopes_at(family: LawLoops, point: Float[Array, " n"]) -> tuple[Array, Arra
     return by_uncertain, peak_by_point[behind:] + peak_by_point[:solved] @ by_uncertain
 
 
-@jax.jit
-def _amplitude_slopes(family: LawLoops, points: Float[Array, "points n"]) -> Float[Array, "points uncertain"]:
-    return jax.vmap(lambda point: _slopes_at(family, point)[1])(points)
-
-
 def drawn_exponents(
     scene: Scene,
     given: Mapping[str, Float[np.ndarray, " values"]],
     uncertain: UncertainParameters,
     *,
     draws: int,
-    impacts: int,
-    transient: int,
+    **lengths: Any,
 ) -> Float[np.ndarray, "values 2"]:
     """Return the interval that holds 95 % of the larger exponents per impact of drawn scenes; NaN where unknown.
 
@@ -146,29 +129,18 @@ def drawn_exponents(
         given: values of a parameter by its path, or nothing.
         uncertain: what is drawn.
         draws: how many.
-        impacts: of `lyapunov_spectrum`.
-        transient: of `lyapunov_spectrum`.
+        lengths: `impacts` and `transient` of `lyapunov_spectrum`.
     """
-    for path in given:
-        uncertain = uncertain.without(path)
-    drawn = uncertain.possible_draws(draws)
-    count = len(next(iter(given.values()), np.zeros(1)))
-    columns = {path: np.repeat(values, draws) for path, values in given.items()}
-    columns |= {path: np.tile(column, count) for path, column in zip(uncertain.paths, drawn.T, strict=True)}
-    exponents = lyapunov_spectrum(scene_batch(scene, columns), impacts=impacts, transient=transient)
-    larger = exponents.exponents_per_impact[:, 0].reshape(count, draws)
-    return np.stack([np.quantile(larger, level, axis=1, method="nearest") for level in _BETWEEN], axis=1)
+    larger = []
+    for drawn in uncertain.without(*given).scenes(scene, draws):
+        motions = scene_batch(drawn, given) if given else drawn
+        found = lyapunov_spectrum(motions, **lengths)
+        larger.append(np.atleast_2d(found.exponents_per_impact)[:, 0])
+    return np.quantile(larger, _BETWEEN, axis=0, method="nearest").T
 
 
 def verdict_probability(
-    scene: Scene,
-    parameter: str,
-    sweep: BifurcationDiagram,
-    uncertain: UncertainParameters,
-    *,
-    start: tuple[float, float, float] | None = None,
-    draws: int,
-    impacts: int,
+    scene: Scene, parameter: str, sweep: BifurcationDiagram, uncertain: UncertainParameters, *, draws: int, **how: Any
 ) -> Float[np.ndarray, " values"]:
     """Return the fraction of drawn scenes whose sweep comes to the same verdict, at each value.
 
@@ -177,15 +149,14 @@ def verdict_probability(
         parameter: that is swept.
         sweep: of the scene.
         uncertain: what is drawn.
-        start: of the sweeps, as of `bifurcation_diagram`.
         draws: how many.
-        impacts: at each value.
+        how: `start` and `impacts` of `bifurcation_diagram`.
     """
-    names, same = np.array(sweep.verdicts.names()), np.zeros(len(sweep.values))
+    names, same = np.array(sweep.verdicts.names()), []
     for drawn in uncertain.without(parameter).scenes(scene, draws):
-        other = bifurcation_diagram(drawn, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
-        same += names == np.array(other.verdicts.names())
-    return same / draws
+        other = bifurcation_diagram(drawn, parameter, sweep.values, upward=sweep.upward, **how)
+        same.append(names == np.array(other.verdicts.names()))
+    return np.mean(same, axis=0)
 
 
 def drawn_shares(
@@ -204,9 +175,9 @@ def drawn_shares(
     # so many starts along each axis are enough for a draw
     rows, columns = (min(count, 100) for count in basins.attractor.shape)
     ends = max(float(speed[0] - half), 0.0), float(speed[-1] + half)
-    shares = np.zeros((draws, len(basins.attractors)))
-    for number, drawn in enumerate(uncertain.scenes(scene, draws)):
+    shares = []
+    for drawn in uncertain.scenes(scene, draws):
         other = basins_of_attraction(drawn, columns=columns, rows=rows, speeds_nm_per_us=ends)
         there = {attractor.name: share for attractor, share in zip(other.attractors, other.share, strict=True)}
-        shares[number] = [there.get(attractor.name, 0.0) for attractor in basins.attractors]
+        shares.append([there.get(attractor.name, 0.0) for attractor in basins.attractors])
     return np.quantile(shares, _BETWEEN, axis=0).T

@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import CsvColumns, columns_of, csv_columns
+from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Tips, recorded
-from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
+from afm_jax.dynamics.starts import evenly_spread, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
+from afm_jax.motion.start import rebound_of_leaving
 from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.saved import as_json
@@ -128,24 +129,11 @@ def _(result: Basins) -> list[Section]:
 
 @csv_columns.register
 def _(result: Basins) -> CsvColumns:
-    # a row a start, and a row an impact of an attractor
+    # a row a start
     names = np.array([attractor.name for attractor in result.attractors])
     phase, speed = np.meshgrid(result.phase_rad, result.rebound_speed_nm_per_us)
-    starts = {
-        "phase_rad": phase.ravel(),
-        "rebound_speed_nm_per_us": speed.ravel(),
-        "attractor": names[result.attractor.ravel()],
-    }
-    points = [
-        {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
-        | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
-        for row in as_json(result)["attractors"]
-        # an attractor without an impact has a row, too
-        for phase, velocity in zip(
-            row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
-        )
-    ]
-    return {"basins.csv": starts, "attractors.csv": columns_of(points)}
+    columns = {"phase_rad": phase, "rebound_speed_nm_per_us": speed, "attractor": names[result.attractor]}
+    return {"basins.csv": {name: column.ravel() for name, column in columns.items()}}
 
 
 @checked
@@ -175,9 +163,7 @@ def basins_of_attraction(
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:
         raise ValueError("basins are those of one scene, on a grid of 2 x 2 starts or more")
     if speeds_nm_per_us is None:
-        batch = jax.tree.map(lambda leaf: leaf[None], scene)
-        usual = leaving_tips(batch)
-        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - _velocity(batch.platform, usual.time_us))[0]))
+        speeds_nm_per_us = 0.0, 4.0 * float(rebound_of_leaving(scene))
     low, high = speeds_nm_per_us
     if not 0.0 <= low < high:
         raise ValueError(f"`speeds_nm_per_us` must rise from 0 or more, but is {speeds_nm_per_us}")
@@ -194,10 +180,8 @@ def basins_of_attraction(
         finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
-    order = [number for number in np.argsort(-count, kind="stable") if count[number]]
-    place = np.full(len(count), -1)
-    place[order] = np.arange(len(order))
-    label = place[label].reshape(rows, columns)
+    rank = np.argsort(-count, kind="stable")
+    label, order = np.argsort(rank)[label].reshape(rows, columns), rank[count[rank] > 0]
     share = count[order] / label.size
 
     def in_lab(attractor: Attractor) -> Attractor:
@@ -254,7 +238,7 @@ class _Finder:
     def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
         """Return the attractors of motions after a long time; new ones are added to those known."""
         count = len(tips.time_us)
-        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, accuracy=1e-6, report=report)
+        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, report=report)
         names, label = verdicts.names(), np.empty(count, int)
         for lane, m in enumerate(verdicts.impacts.tolist()):
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])

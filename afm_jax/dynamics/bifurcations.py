@@ -13,14 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record, Tips
-from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
+from afm_jax.dynamics.many_tips import Tips
+from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Motions, Verdicts, motions_of
 from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
@@ -28,7 +28,7 @@ from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
-from afm_jax.solve.lanes import LANES, Report
+from afm_jax.solve.lanes import LANES, WIDTHS, Report
 from afm_jax.units import within_turn
 
 
@@ -40,28 +40,21 @@ class BifurcationDiagram(ResultTuple):
         values: of the parameter, ascending.
         upward: whether the parameter rises from value to value.
         verdicts: what the motion has come to at each value.
-        restarted: the tip began anew there: it was held, or had flown away, at the value before.
         phase_rad: drive phase, in [0, 2 pi), at the end of each of the last impacts, (values, impacts); NaN where there
             was none. Of an orbit of m impacts the last m.
         approach_nm_per_us: approach speeds of these impacts.
         velocity_after_nm_per_us: velocities of the tip in the lab after these impacts.
         height_nm: heights of the platform when the tip arrives.
-        strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
-            (values, drive periods), of the last ones.
-        complete: False where stretches still went on when they had been ramped over the most values.
         verdict_probability: at each value the fraction of drawn laws with this verdict; None: no laws were drawn.
     """
 
     values: Float[np.ndarray, " values"]
     upward: bool
     verdicts: Verdicts
-    restarted: Bool[np.ndarray, " values"]
     phase_rad: Float[np.ndarray, "values impacts"]
     approach_nm_per_us: Float[np.ndarray, "values impacts"]
     velocity_after_nm_per_us: Float[np.ndarray, "values impacts"]
     height_nm: Float[np.ndarray, "values impacts"]
-    strobe_height_nm: Float[np.ndarray, "values periods"]
-    complete: bool
     verdict_probability: Float[np.ndarray, " values"] | None = None
 
     @property
@@ -74,12 +67,10 @@ class BifurcationDiagram(ResultTuple):
 def _(ramp: BifurcationDiagram) -> dict[str, Any]:
     return _probability(ramp) | {
         "direction": ramp.direction,
-        "complete": ramp.complete,
         "values": ramp.values,
         "verdicts": ramp.verdicts.names(),
         "impacts": ramp.verdicts.impacts,
         "periods": ramp.verdicts.periods,
-        "restarted": ramp.restarted,
         "phase_rad": [row[np.isfinite(row)] for row in ramp.phase_rad],
         "platform_height_nm": [row[np.isfinite(row)] for row in ramp.height_nm],
     }
@@ -102,8 +93,8 @@ def _(ramp: BifurcationDiagram) -> list[Section]:
 
 @csv_columns.register
 def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
-    # a row a value, an impact, and a height when the drive's phase is 0
-    verdicts = {"verdict": np.array(ramp.verdicts.names()), "restarted": ramp.restarted}
+    # a row a value, and an impact
+    verdicts = {"verdict": np.array(ramp.verdicts.names())}
     impacts = {
         "phase_rad": ramp.phase_rad,
         "approach_speed_nm_per_us": ramp.approach_nm_per_us,
@@ -113,7 +104,6 @@ def _(ramp: BifurcationDiagram, parameter: str = "value") -> CsvColumns:
     files = {
         "bifurcation.csv": (verdicts | _probability(ramp), np.ones(len(ramp.values), bool)),
         "impacts.csv": (impacts, np.isfinite(ramp.phase_rad)),
-        "strobe.csv": ({"height_nm": ramp.strobe_height_nm}, np.isfinite(ramp.strobe_height_nm)),
     }
     return {
         file: {
@@ -176,7 +166,7 @@ def _(ramps: Ramps) -> CsvColumns:
 
 
 @checked
-def bifurcation_diagram(  # noqa: PLR0913
+def bifurcation_diagram(
     scene: Scene,
     parameter: str,
     values: Float[np.ndarray, " values"] | None = None,
@@ -184,7 +174,6 @@ def bifurcation_diagram(  # noqa: PLR0913
     start: tuple[float, float, float] | None = None,
     upward: bool = True,
     impacts: int = 2000,
-    accuracy: float = 1e-6,
     report: Report | None = None,
 ) -> BifurcationDiagram:
     """Return the last impacts of the motion at each value of a parameter, which is ramped up or down.
@@ -197,7 +186,6 @@ def bifurcation_diagram(  # noqa: PLR0913
             single-impact orbit of the order nearest to resonance, else leaving the platform upward.
         upward: from the lowest value to the highest, or the other way round.
         impacts: at each value; the last of them are recorded.
-        accuracy: of resolved contacts, as for `simulate`.
         report: called with how many of how many values are done, in the first ramp.
 
     Raises:
@@ -215,10 +203,8 @@ def bifurcation_diagram(  # noqa: PLR0913
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
     begin = None if start is None else seen.start(start_of(scenes, start))
     fresh = jax.tree.map(np.asarray, batch_and_tips(seen.scenes, begin)[1])
-    ramped, complete = _ramped(jax.tree.map(np.asarray, seen.scenes), fresh, impacts, accuracy, report)
-    restarted = np.append(False, ramped.end.outcome[:-1] != Outcome.IMPACT)
-    order = slice(None) if upward else slice(None, None, -1)
-    seen, platform, ramped, restarted = _rows_of((seen, scenes.platform, ramped, restarted), order)
+    ramped = _ramped(jax.tree.map(np.asarray, seen.scenes), fresh, impacts, report)
+    seen, platform, ramped = _rows_of((seen, scenes.platform, ramped), slice(None, None, 1 if upward else -1))
     record, verdicts = ramped.record, ramped.verdicts
     shown = _shown(verdicts)
 
@@ -234,13 +220,10 @@ def bifurcation_diagram(  # noqa: PLR0913
         values=ordered,
         upward=upward,
         verdicts=verdicts,
-        restarted=restarted,
         phase_rad=known(within_turn(omega * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(record.velocity_after_nm_per_us + seen.response(record.departure_us)[1]),
         height_nm=known(offset + amplitude * np.cos(omega * record.arrival_us + ahead)),
-        strobe_height_nm=_strobes(seen, record, shown),
-        complete=complete,
     )
 
 
@@ -249,40 +232,36 @@ def _shown(verdicts: Verdicts) -> Bool[np.ndarray, "values impacts"]:
     return (verdicts.impacts[:, None] == 0) | (np.arange(RECORDED, 0, -1) <= verdicts.impacts[:, None])
 
 
-def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: Report | None) -> tuple[Motions, bool]:
-    """Return what tips come to at all values, and whether no stretch was left to go on.
+def _ramped(scenes: Scene, fresh: Tips, impacts: int, report: Report | None) -> Motions:
+    """Return what tips come to at all values.
 
     Args:
         scenes: at the values, in the order of the ramp.
         fresh: tips that begin there.
         impacts: at each value.
-        accuracy: of resolved contacts.
         report: called with how many of how many values are done.
     """
     count = len(fresh.time_us)
     # stretches at most that are ramped side by side: one block of tips
-    length = -(-count // LANES)
-    numbers = starts = np.arange(0, count, length)
+    numbers = starts = np.arange(0, count, -(-count // LANES))
     # few tips with laws, so that a lane that goes on alone does not wait for many
-    how = {"accuracy": accuracy, "block": LANES if isinstance(scenes.interaction, Contact) else 16}
-    at, begin = _rows_of((scenes, fresh), starts)
-    rows = motions_of(at, begin, impacts, **how)
-    # no motion is of the kind -1
-    ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
-    # a lane goes on over so many values at most beyond its stretch
-    for step in range(1, length + 320):
+    widths = WIDTHS if isinstance(scenes.interaction, Contact) else (16,)
+    step, ramped, begin = 0, None, _rows_of(fresh, starts)
+    while True:
+        rows = motions_of(_rows_of(scenes, numbers), begin, impacts, widths=widths)
+        if ramped is None:
+            # no motion is of the kind -1
+            ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
         new = ~_same(rows, _rows_of(ramped, numbers))
         for part, values in zip(jax.tree.leaves(ramped), jax.tree.leaves(rows), strict=True):
             part[numbers[new]] = values[new]
-        numbers = numbers[new & (numbers + 1 < count)] + 1
+        numbers, step = numbers[new & (numbers + 1 < count)] + 1, step + 1
         if not numbers.size:
-            return ramped, True
+            return ramped
         if report is not None:
             report(min(step * len(starts), count), count)
         before, end = _rows_of((scenes, ramped.end), numbers - 1)
-        at, begin = _rows_of((scenes, fresh), numbers)
-        rows = motions_of(at, carried(before, at, begin, end), impacts, **how)
-    return ramped, False
+        begin = carried(before, *_rows_of((scenes, fresh), numbers), end)
 
 
 @jax.jit
@@ -321,27 +300,3 @@ def _same(one: Motions, other: Motions) -> Bool[np.ndarray, " lanes"]:
     # of the largest speed
     near = np.abs(speeds - others).max(axis=1) <= 1e-4 * np.maximum(others[:, -1], 1e-12)
     return same & (near | (a.kind != MotionKind.ORBIT))
-
-
-def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray) -> Float[np.ndarray, "values heights"]:
-    """Return the tip's heights whenever the drive's phase is 0: with a moving platform, whenever it is highest."""
-    # of the last 48 flights, and 8 heights at most in a flight
-    period, some = np.asarray(seen.scenes.platform.period_us), slice(-49, None)
-    # in periods of the scene's own clock
-    ahead = np.asarray(seen.frame.phase_rad)[:, None] / (2.0 * np.pi)
-    begin = record.turns(period)[:, some][:, :-1] + ahead
-    end = (record.arrival_periods + record.arrival_us / period[:, None])[:, some][:, 1:] + ahead
-    strobe = np.ceil(begin)[..., None] + np.arange(8)
-    flown = np.nan_to_num((strobe - begin[..., None]) * period[:, None, None])
-    departure, velocity = (
-        part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)
-    )
-
-    def height_of(scene: Scene, departure: Any, velocity: Any, flown: Any) -> Array:
-        start = scene.platform.position(departure) + gap_of_departure(scene)
-        return scene.cantilever.propagator(flown)(start, velocity)[0]
-
-    height = jax.vmap(height_of)(seen.scenes, departure, velocity, flown)
-    height = np.asarray(height + seen.response(-ahead * period[:, None])[0][..., None])
-    inside = shown[:, some][:, 1:, None] & (strobe < end[..., None])
-    return np.where(inside, height, np.nan).reshape(len(period), -1)

@@ -5,7 +5,7 @@ judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 a
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,9 +20,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.checks import check_kind, checked
 from afm_jax.columns import CsvColumns, csv_columns
-from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
-from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.starts import SampleDriven, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import impact_law_of
@@ -31,7 +29,7 @@ from afm_jax.report import Section, sections
 from afm_jax.results import Result, public_result
 from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
-from afm_jax.solve.lanes import Report, again_for, in_blocks
+from afm_jax.solve.lanes import WIDTHS, Report, again_for, in_blocks
 
 
 class OrbitVerdicts(NamedTuple):
@@ -40,20 +38,14 @@ class OrbitVerdicts(NamedTuple):
     ``stable``: an orbit that is admissible and stable. ``admissible``: an admissible orbit, stable or not.
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
-    ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
-    ``approach_speed_nm_per_us``, of laws only: of the stable one's impact.
+    ``approach_speed_nm_per_us``: of the stable one's impact.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
     admissible: Bool[np.ndarray, "orders scenes"]
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
     largest_multiplier: Float[np.ndarray, "orders scenes"]
-    unresolved: Bool[np.ndarray, "orders scenes"] | None = None
-    approach_speed_nm_per_us: Float[np.ndarray, "orders scenes"] | None = None
-
-    def any_stable(self) -> Bool[np.ndarray, " scenes"]:
-        """Return where an orbit of any order is stable."""
-        return np.asarray(self.stable.any(axis=0))
+    approach_speed_nm_per_us: Float[np.ndarray, "orders scenes"]
 
 
 def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | None = None) -> OrbitVerdicts:
@@ -62,15 +54,14 @@ def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | Non
     Roots are searched for at all scenes; only where there is one its orbit is looked at.
 
     Args:
-        scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
+        scenes: a batch of scenes with a law: every parameter has shape (scenes,).
         orders: N.
         report: called with how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scenes have no law.
     """
-    if isinstance(scenes.interaction, Contact):
-        return OrbitVerdicts(**single_contact_orbits(scenes, orders, report=report))
     seen = sample_driven(scenes)
     names = ("peak_amplitude_nm", "largest_multiplier", "approach_speed_nm_per_us")
 
@@ -80,7 +71,7 @@ def orbit_verdicts(scenes: Scene, orders: Sequence[int], *, report: Report | Non
         return OrbitVerdicts(stable, admissible, **{name: orbits[name] for name in names})
 
     # few enough for the cache, many enough to fill the vector units
-    return jax.tree.map(np.transpose, in_blocks(work, seen, block=1024, report=report))
+    return jax.tree.map(np.transpose, in_blocks(work, seen, widths=(*WIDTHS, 1024), report=report))
 
 
 ORBIT_NUMBERS = (
@@ -189,18 +180,13 @@ class StabilityChart(Result):
     @property
     def any_stable(self) -> Bool[np.ndarray, "rows columns"]:
         """Where an orbit of any order is stable and admissible."""
-        return self._plane(self.verdicts.any_stable()[None])[0]
+        return np.asarray(self.stable.any(axis=0))
 
     @property
     def lowest_stable_order(self) -> Int[np.ndarray, "rows columns"]:
         """The lowest order with a stable admissible orbit; 0 where there is none."""
         stable = self.stable
         return np.where(stable.any(axis=0), stable.argmax(axis=0) + 1, 0)
-
-    @property
-    def stable_share(self) -> float:
-        """Share of the chart's area with a stable orbit of any order."""
-        return float(self.verdicts.any_stable().mean())
 
     def points(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Return reduced frequency and drive amplitude of every point, in the order of the verdicts."""
@@ -226,9 +212,8 @@ class StabilityChart(Result):
 
     @property
     def impact_speeds_nm_per_us(self) -> Any:
-        """Approach speeds of the orbits in the output; none of a contact's."""
-        speeds = self.verdicts.approach_speed_nm_per_us
-        return () if speeds is None else speeds
+        """Approach speeds of the orbits in the output."""
+        return self.verdicts.approach_speed_nm_per_us
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:
         return rows.reshape(len(rows), len(self.y_values), len(self.x_values))
@@ -236,20 +221,20 @@ class StabilityChart(Result):
 
 @as_json.register
 def _(chart: StabilityChart) -> dict[str, Any]:
-    verdicts, told = chart.verdicts, {}
-    for axis, given in (("x", chart.x), ("y", chart.y)):
-        if given is not None:
-            told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+    verdicts, axes = chart.verdicts, {"x": chart.x, "y": chart.y}
+    told: dict[str, Any] = {
+        axis: {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+        for axis, given in axes.items()
+        if given is not None
+    }
     told |= {
         "orders": list(range(1, chart.orders + 1)),
         "points": verdicts.stable.shape[1],
         "admissible_share": verdicts.admissible.mean(axis=1),
         "stable_share": verdicts.stable.mean(axis=1),
-        "any_stable_share": chart.stable_share,
+        "any_stable_share": float(chart.any_stable.mean()),
         "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
     }
-    if verdicts.unresolved is not None:
-        told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
     if chart.probability is not None:
         told["uncertain_share"] = ((chart.probability > 0.0) & (chart.probability < 1.0)).mean(axis=1)
     return told
@@ -272,7 +257,7 @@ def _(chart: StabilityChart) -> CsvColumns:
     x, y = ("x" if chart.x is None else chart.x.path, "y" if chart.y is None else chart.y.path)
     columns: dict[str, Any] = dict(zip((x, y), chart.points(), strict=True))
     columns["lowest_stable_order"] = chart.lowest_stable_order.ravel()
-    names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
+    names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier")
     arrays = {name: getattr(chart.verdicts, name) for name in names} | {"stable_probability": chart.probability}
     for order in range(chart.orders):
         columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
@@ -301,28 +286,28 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if `scene_of` gives something else than a scene.
+        TypeError: if `scene_of` gives something else than a scene with a law.
         ValueError: if the scenes do not repeat with one drive period, the values do not rise, or there is no order to
             look for.
     """
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
+    across, up = None, None
     if isinstance(scene_of, Scene):
         across, up = (
             parse_range(given if isinstance(given, ParameterRange) else str(given), counted=True)
             for given in (x_values, y_values)
         )
         check_ranges(scene_of, across, up)
-        values = {"x_values": across.values, "y_values": up.values}
-        family = scene_family(scene_of, across.path, up.path)
-        return replace(stability_chart(family, **values, last_order=last_order, report=report), x=across, y=up)
+        x_values, y_values = across.values, up.values
+        scene_of = scene_family(scene_of, across.path, up.path)
     x, y = (np.asarray(values, float) for values in (x_values, y_values))
     for name, values in (("x_values", x), ("y_values", y)):
         if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):
             raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), range(1, last_order + 1), report=report)
-    return StabilityChart(x, y, verdicts)
+    return StabilityChart(x, y, verdicts, across, up)
 
 
 def stable_probability(
@@ -345,11 +330,7 @@ def stable_probability(
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:
     """Return one scene a row of some columns of arguments, as a batch."""
-
-    def made(*values: Array) -> Scene:
-        scene = scene_of(*values)
-        check_kind("scene_of(...)", scene, Scene)
-        return scene
-
     # operation by operation, which JAX knows again: a program of a new function would be compiled at every call
-    return eqx.filter_vmap(made)(*(jnp.asarray(column, float) for column in columns))
+    scenes = eqx.filter_vmap(scene_of)(*(jnp.asarray(column, float) for column in columns))
+    check_kind("scene_of(...)", scenes, Scene)
+    return scenes

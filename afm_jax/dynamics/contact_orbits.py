@@ -5,14 +5,14 @@ tips come to that are simulated for a while. The map's Jacobian is the forward d
 loop is closed to rounding and its multipliers are exact.
 """
 
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
@@ -20,10 +20,8 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.dynamics.impact_loop import (
-    GRAZING,
     LoopFamily,
     LoopReading,
-    driven_part,
     highest_of_flights,
     impacts_at,
     lowest_gap,
@@ -34,25 +32,22 @@ from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
     loops_told_apart,
-    multipliers_of,
     orbits_of,
 )
-from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, next_departures, tips_after_contacts
-from afm_jax.dynamics.starts import evenly_spread, laws_of, leaving_tips, sample_driven
-from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
+from afm_jax.dynamics.many_tips import next_departures, tips_after_contacts
+from afm_jax.dynamics.starts import evenly_spread, sample_driven, tips_at
 from afm_jax.motion.record import ContactKind
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
-from afm_jax.motion.start import default_start, gap_of_departure
+from afm_jax.motion.start import gap_of_departure, rebound_of_leaving
 from afm_jax.solve.arclength import EquationsAt, PointInPlane
-from afm_jax.solve.lanes import WIDTHS, Report, in_blocks
-from afm_jax.solve.newton import LinearisedRows, Newton, Roots, newton_rows, shortened
+from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
-_STARTS = 8
-"""Tips that are simulated for guesses, besides the one that starts where `simulate` does."""
+_STARTS = 9
+"""Tips that are simulated for guesses."""
 _SETTLING = 60
 """Contacts before their guesses."""
-CHART_ACCURACY = 1e-6
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
@@ -60,14 +55,13 @@ _DIFFERENCE = 1e-5
 
 
 @checked
-def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = DEFAULT_ACCURACY) -> ManyImpactOrbits:
+def contact_orbits(scene: Scene, order: int, impacts: int) -> ManyImpactOrbits:
     """Return the orbits of m contacts in N drive periods of a scene with a contact.
 
     Args:
         scene: one scene with a `Contact`, driven with one period.
         order: N, drive periods until the motion repeats.
         impacts: m, contacts in them.
-        accuracy: of `simulate`.
 
     Returns:
         The orbits; a contact begins where the bridge forms and ends at `end_of_contact`. In the reading phases and
@@ -85,8 +79,8 @@ def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = 
     if not isinstance(scene.interaction, Contact):
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
     check_loop(order, impacts)
-    family = ContactLoops.of(scene, order, accuracy=accuracy)
-    loops, _ = family.found(np.zeros(0), impacts)
+    family = ContactLoops.of(scene, order)
+    loops = family.found(np.zeros(0), impacts)
     return orbits_of(loops, family.readings(loops))
 
 
@@ -130,232 +124,110 @@ class FlownLoop(NamedTuple):
         return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest
 
 
-def _flown(
-    scenes: Scene,
-    loops: Float[np.ndarray, "loops n"],
-    order: int,
-    values: Float[np.ndarray, "loops parameters"] | None = None,
-    *,
-    few: bool = False,
-    **settings: Any,
-) -> list[FlownLoop | None]:
-    """Return loops with each of their contacts simulated, all at once; None where one does not end in time.
-
-    Args:
-        scenes: of each loop, NumPy arrays.
-        loops: of each m departure phases in rad and m rebound speeds in nm/us.
-        order: N.
-        values: of parameters.
-        few: in blocks of 16, else of 1, 16 or 128.
-        settings: paths of the parameters, the driven part and the accuracy, as of `next_departures`.
-    """
-    count, turn = loops.shape[1] // 2, 2.0 * np.pi * order
-    phase, rebound = loops[:, :count], loops[:, count:]
-    following = np.concatenate([phase[:, 1:], phase[:, :1] + turn], axis=1)
-    shortest = np.min(following - phase, axis=1, keepdims=True)
-    flown: list[FlownLoop | None] = [None] * len(loops)
-    flies = np.flatnonzero((shortest[:, 0] > 0.0) & (rebound > 0.0).all(axis=1))
-    if not flies.size:
-        return flown
-    parameters = np.zeros((len(loops), 0)) if values is None else values
-    unknowns = np.concatenate(
-        [np.stack([phase, rebound], axis=2), np.repeat(parameters[:, None], count, axis=1)], axis=2
-    )
-    # a contact may take longer than expected by this, in flights of the loop
-    until = (following + 0.5 * shortest)[flies]
-    lanes = (
-        jax.tree.map(lambda leaf: np.repeat(leaf[flies], count, axis=0), scenes),
-        *(part.reshape(flies.size * count, *part.shape[2:]) for part in (unknowns[flies], until)),
-    )
-    # of a few loops: one program for all numbers of contacts
-    block, widths = (16, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
-    results = in_blocks(lambda part: next_departures(*part, **settings), lanes, block=block, widths=widths)
-    later, maps, contacts, there = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), results)
-    ends = (contacts.kind == ContactKind.IMPACT).all(axis=1) & np.isfinite(maps).all(axis=(1, 2, 3))
-    omega = RAD_PER_US_PER_KHZ * getattr(there, settings.get("driven", "platform")).frequency_khz
-    for row in np.flatnonzero(ends):
-        number = flies[row]
-        gaps = later[row].T - np.stack([following[number], np.roll(rebound[number], -1)])
-        scene = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row, 0]), there)
-        contact = jax.tree.map(lambda leaf, row=row: leaf[row], contacts)
-        departures = phase[number] / np.asarray(omega)[row]
-        flown[number] = FlownLoop(scene, loops[number], gaps.ravel(), maps[row], contact, departures)
-    return flown
-
-
-def _closed(
-    flown: Callable[[Float[np.ndarray, "open n"], Int[np.ndarray, " open"]], list[FlownLoop | None]],
-    guesses: Float[np.ndarray, "guesses n"],
-    settings: Newton,
-) -> Roots:
-    """Return the loops that Newton's method finds, departure phases and rebound speeds; `FlownLoop` in the details.
-
-    Args:
-        flown: simulates loops, given with the numbers of their rows.
-        guesses: first loops.
-        settings: of Newton's method: phases in rad, speeds of the fastest one.
-    """
-    count = guesses.shape[1] // 2
-
-    def units(loops: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
-        fastest = loops[:, count:].max(axis=1, keepdims=True)
-        return np.repeat(np.concatenate([np.ones_like(fastest), fastest], axis=1), count, axis=1)
-
-    def damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
-        longest = np.concatenate([np.ones((len(loops), count)), loops[:, count:]], axis=1)
-        # of a phase in rad, and of a speed
-        return shortened(step, 0.3 * longest)
-
-    def linearised(loops: Float[np.ndarray, "loops n"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
-        residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
-        details = flown(loops, rows)
-        for row, loop in enumerate(details):
-            if loop is not None:
-                residual[row], slopes[row] = loop.gaps, loop.slopes[:, : loops.shape[1]]
-        return LinearisedRows(residual / units(loops), slopes / units(loops)[:, :, None], details)
-
-    return newton_rows(linearised, guesses, settings._replace(unit=units, damping=damped))
-
-
 def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
     """Return the orbits of the law with delay closest to the contact, as guesses: m departure phases, m speeds."""
     law = approximate_law(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
         return np.zeros((0, 2 * impacts))
     family = LawLoops.of(eqx.tree_at(lambda scene: scene.interaction, scene, law), order)
-    loops, _ = family.found(np.zeros(0), impacts)
-    of_law = jax.vmap(lambda loop: impacts_at(*family.at(loop)))(jnp.asarray(loops))
+    of_law = jax.vmap(lambda loop: impacts_at(*family.at(loop)))(jnp.asarray(family.found(np.zeros(0), impacts)))
     omega, rebound = float(drive_of(scene).angular_frequency), np.asarray(of_law.speeds.rebound)
     # a straight path to the gap at which contact ends
     phases = omega * (np.asarray(of_law.leaving_us) + float(gap_of_departure(scene)) / rebound)
     return np.concatenate([phases, rebound], axis=1)[(rebound > 0.0).all(axis=1)]
 
 
-def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
+def _repetitions(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
     """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses.
 
-    The tips start evenly spread, and where `simulate` starts. They are simulated in the frame in which the drive is a
-    platform's: what they come to does not depend on the clock that the drive's phase counts in.
+    The tips start evenly spread. They are simulated in the frame in which the drive is a platform's: what they come to
+    does not depend on the clock that the drive's phase counts in.
     """
     seen = sample_driven(scene)
     platform = seen.scenes.platform
-    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS + 1, *leaf.shape)), seen.scenes)
-    leaving, period = leaving_tips(scenes), float(platform.period_us)
-    across, up = evenly_spread(_STARTS).T
-    usual = seen.start(default_start(scene))
-    faster = float(leaving.velocity_nm_per_us[0] - platform.velocity(leaving.time_us[0])) * (0.5 + 3.0 * up)
-    tips = leaving._replace(
-        time_us=np.append(period * across, usual.time_us),
-        gap_nm=np.append(leaving.gap_nm[1:], usual.position_nm - platform.position(usual.time_us)),
-        velocity_nm_per_us=np.append(platform.velocity(period * across) + faster, usual.velocity_nm_per_us),
-    )
-    _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
+    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), seen.scenes)
+    period, (across, up) = float(platform.period_us), evenly_spread(_STARTS).T
+    faster = float(rebound_of_leaving(seen.scenes)) * (0.5 + 3.0 * up)
+    tips = tips_at(scenes, period * across, np.asarray(platform.velocity(period * across)) + faster)
+    _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=DEFAULT_ACCURACY)
     turns = record.departure_periods + record.departure_us / period + float(seen.frame.phase_rad) / (2.0 * np.pi)
     rebound = record.velocity_after_nm_per_us - np.asarray(platform.velocity(record.departure_us))
-    guesses = []
-    for lane in range(_STARTS + 1):
-        for begin in range(impacts + 1):
-            window = turns[lane, begin : begin + impacts + 1]
-            # the contacts of a guess may miss N drive periods by this
-            if abs(window[-1] - window[0] - order) < 0.05:
-                phases = 2.0 * np.pi * (window[:-1] - np.floor(window[0]))
-                guesses.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
-    return guesses
-
-
-def single_contact_orbits(
-    scenes: Scene, orders: Sequence[int], *, accuracy: float = CHART_ACCURACY, report: Report | None = None
-) -> dict[str, Shaped[np.ndarray, "orders lanes"]]:
-    """Return which orbits of one contact there are at many scenes with a contact.
-
-    Every orbit of the law with delay closest to the contact is a guess, from which Newton's method closes the simulated
-    map. What the law lacks is not found, and where no guess closes there may be an orbit nevertheless: ``unresolved``.
-
-    Args:
-        scenes: a batch.
-        orders: N.
-        accuracy: of `simulate`.
-        report: called with how far it is, in scenes.
-
-    Returns:
-        ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,
-        ``peak_amplitude_nm`` and ``largest_multiplier``, NaN where there is none.
-
-    Raises:
-        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scenes were built.
-        ValueError: if the scenes do not repeat with one drive period.
-    """
-    sample_driven(scenes)  # refuses scenes that do not repeat
-    shape = len(orders), len(scenes.platform.frequency_khz)
-    columns = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
-    columns |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
-    laws = laws_of(jax.tree.map(jnp.asarray, scenes))
-    if laws is None:
-        return columns
-    plain, driven = jax.tree.map(np.asarray, scenes), driven_part(jax.tree.map(lambda leaf: leaf[0], scenes))
-    law_scenes = jax.tree.map(np.asarray, eqx.tree_at(lambda each: each.interaction, scenes, laws[0]))
-    for number, order in enumerate(orders):
-
-        def of_law(block: Scene, order: int = order) -> SingleImpactOrbits:
-            return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
-
-        orbits = in_blocks(of_law, law_scenes, block=CONTACTS_AT_ONCE)
-        lane, slot = np.nonzero(orbits.exists & orbits.admissible & laws[1][:, None])
-        rebound = orbits.rebound_speed_nm_per_us[lane, slot]
-        # a straight path to the gap at which contact ends
-        omega = RAD_PER_US_PER_KHZ * getattr(plain, driven).frequency_khz
-        rise = np.asarray(omega * gap_of_departure(scenes))
-        guesses = np.stack([orbits.phase_rad[lane, slot] + rise[lane] / rebound, rebound], axis=1)
-
-        def flown(
-            loops: np.ndarray, rows: np.ndarray, lane: np.ndarray = lane, order: int = order
-        ) -> list[FlownLoop | None]:
-            chosen = jax.tree.map(lambda leaf: leaf[lane[rows]], plain)
-            return _flown(chosen, loops, order, driven=driven, accuracy=accuracy)
-
-        roots = _closed(flown, guesses, _CLOSING_A_CHART)
-        columns["unresolved"][number, lane[~roots.converged]] = True
-        for row in np.flatnonzero(roots.converged):
-            place, loop = (number, lane[row]), roots.details[row]
-            columns["admissible"][place], columns["unresolved"][place] = True, False
-            largest, _ = np.abs(multipliers_of(*map(np.asarray, trace_and_determinant(loop.maps))))
-            multiplier, peak = largest, float(loop.heights()[0])
-            if multiplier < 1.0 and not peak < columns["peak_amplitude_nm"][place]:
-                columns["stable"][place] = True
-                columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak, multiplier
-        if report is not None:
-            report((number + 1) * shape[1] // shape[0], shape[1])
-    return columns
-
-
-_CLOSING = Newton(rounds=25, step_tolerance=1e-10, residual_tolerance=1e-10)
-_CLOSING_A_CHART = Newton(rounds=15, residual_tolerance=1e-7)
+    (times, speeds) = (sliding_window_view(part, impacts + 1, axis=1) for part in (turns, rebound))
+    # the contacts of a guess may miss N drive periods by this
+    near = np.abs(times[..., -1] - times[..., 0] - order) < 0.05
+    phases = 2.0 * np.pi * (times[near] - np.floor(times[near][:, :1]))
+    return np.concatenate([phases[:, :-1], speeds[near][:, :-1]], axis=1)
 
 
 class ContactLoops(LoopFamily):
     """Loops of a scene with a contact, each of whose contacts is simulated: departure phases and rebound speeds."""
 
-    accuracy: float = eqx.field(static=True, default=DEFAULT_ACCURACY)
-    """Of `simulate`."""
-
     def flown(
         self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
     ) -> list[FlownLoop | None]:
-        """Return loops in rad and nm/us at values of the parameters as they are simulated."""
-        scenes = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(loops), *np.shape(leaf))), self.scene)
-        settings = {"paths": self.paths, "driven": self.driven, "accuracy": self.accuracy}
-        return _flown(scenes, loops, int(self.order), values, few=True, **settings)
+        """Return loops with each of their contacts simulated, all at once; None where one does not end in time.
 
-    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
+        Args:
+            loops: of each m departure phases in rad and m rebound speeds in nm/us.
+            values: of the parameters.
+        """
+        count = loops.shape[1] // 2
+        phase, rebound = np.split(loops, 2, axis=1)
+        following = np.concatenate([phase[:, 1:], phase[:, :1] + 2.0 * np.pi * float(self.order)], axis=1)
+        shortest = np.min(following - phase, axis=1, keepdims=True)
+        flown: list[FlownLoop | None] = [None] * len(loops)
+        flies = np.flatnonzero((shortest[:, 0] > 0.0) & (rebound > 0.0).all(axis=1))
+        if not flies.size:
+            return flown
+        parameters = np.repeat(values[:, None], count, axis=1)
+        unknowns = np.concatenate([np.stack([phase, rebound], axis=2), parameters], axis=2)
+        # a contact may take longer than expected by this, in flights of the loop
+        until = following + 0.5 * shortest
+        lanes = [part[flies].reshape(flies.size * count, *part.shape[2:]) for part in (unknowns, until)]
+        scenes = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(lanes[1]), *np.shape(leaf))), self.scene)
+
+        def work(some: tuple[Scene, Array, Array]) -> Any:
+            return next_departures(*some, paths=self.paths, driven=self.driven, accuracy=DEFAULT_ACCURACY)
+
+        # one program for all numbers of contacts
+        results = in_blocks(work, (scenes, *lanes), widths=(16,))
+        later, maps, contacts, there = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), results)
+        ends = (contacts.kind == ContactKind.IMPACT).all(axis=1) & np.isfinite(maps).all(axis=(1, 2, 3))
+        omega = np.asarray(RAD_PER_US_PER_KHZ * getattr(there, self.driven).frequency_khz)
+        for row in np.flatnonzero(ends):
+            number = flies[row]
+            gaps = later[row].T - np.stack([following[number], np.roll(rebound[number], -1)])
+            scene, contact = jax.tree.map(lambda leaf, row=row: leaf[row], (there, contacts))
+            scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), scene)
+            departures = phase[number] / omega[row]
+            flown[number] = FlownLoop(scene, loops[number], gaps.ravel(), maps[row], contact, departures)
+        return flown
+
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> Float[np.ndarray, "loops n"]:
         """Return loops of m contacts in rad and nm/us, each once; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
-        guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, self.accuracy)]
+        guesses = np.concatenate([_orbits_of_law(scene, order, impacts), _repetitions(scene, order, impacts)])
 
-        def flown(loops: np.ndarray, _: Any) -> list[FlownLoop | None]:
-            return self.flown(loops, np.tile(values, (len(loops), 1)))
+        def units(loops: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
+            """Return 1 rad for phases and the fastest speed for speeds."""
+            fastest = np.repeat(loops[:, impacts:].max(axis=1, keepdims=True), impacts, axis=1)
+            return np.concatenate([np.ones_like(fastest), fastest], axis=1)
 
-        roots = _closed(flown, np.array(guesses).reshape(-1, 2 * impacts), _CLOSING)
-        return loops_told_apart(roots.x[roots.converged], order), 0
+        def damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops n"]) -> np.ndarray:
+            # of a phase in rad, and of a speed
+            longest = 0.3 * np.concatenate([np.ones_like(loops[:, impacts:]), loops[:, impacts:]], axis=1)
+            return step / np.abs(step / longest).max(axis=1, keepdims=True).clip(1.0)
+
+        def linearised(loops: Float[np.ndarray, "loops n"], _: Any) -> LinearisedRows:
+            residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
+            for row, loop in enumerate(self.flown(loops, np.tile(values, (len(loops), 1)))):
+                if loop is not None:
+                    residual[row], slopes[row] = loop.gaps, loop.slopes[:, : loops.shape[1]]
+            return LinearisedRows(residual / units(loops), slopes / units(loops)[:, :, None])
+
+        closing = Newton(rounds=25, step_tolerance=1e-10, residual_tolerance=1e-10, unit=units, damping=damped)
+        roots = newton_rows(linearised, guesses, closing)
+        return loops_told_apart(roots.x[roots.converged], order)
 
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt | None:
         """Return the closing conditions and the wanted test function at a point of a curve; None where none flies."""
@@ -371,7 +243,7 @@ class ContactLoops(LoopFamily):
         value = here.gaps / units
         slopes = here.slopes * np.concatenate([units, self.width]) / units[:, None]
         if self.test is not None:
-            tests = np.array([self._tests(loop, grazing=self.test == GRAZING)[self.test] for loop in flown])
+            tests = np.array([self._tests(loop)[self.test] for loop in flown])
             value = np.append(value, tests[0])
             slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
         return EquationsAt(value, slopes, here)
@@ -390,12 +262,12 @@ class ContactLoops(LoopFamily):
             return LoopReading(*[*[each] * 6, *[whole] * 3, whole > 0.0, whole])
         return jax.tree.map(lambda *numbers: np.stack([np.asarray(each) for each in numbers]), *map(_reading_of, flown))
 
-    def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
-        """Return the test functions of `LoopFamily.tests`; that of grazing NaN where it is not asked for."""
+    def _tests(self, flown: FlownLoop) -> np.ndarray:
+        """Return the test functions of `LoopFamily.tests`."""
         trace, determinant = trace_and_determinant(flown.maps)
-        near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
+        near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency)
         speeds = np.array([near, np.split(flown.loop, 2)[1].min()]) / float(self.speed_unit)
-        return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
+        return np.append(np.array([1.0 - trace, 1.0 + trace]) + determinant, speeds)
 
 
 def _reading_of(flown: FlownLoop) -> LoopReading:

@@ -18,9 +18,9 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.columns import CsvColumns, columns_of, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactLoops
-from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
+from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on
 from afm_jax.dynamics.impact_loop import CAPTURE, LoopFamily, driven_part
-from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, impact_rows, orbit_facts
+from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, LawLoops, check_loop, orbit_facts
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
@@ -74,11 +74,7 @@ class Continuation(ResultTuple):
     branches: tuple[OrbitBranch, ...]
     special: tuple[SpecialPoint, ...]
     curves: tuple[SpecialCurve, ...]
-    rejected: int
-    """Orbits found to begin with whose flights pass through the surface; not followed."""
     family: LawLoops | ContactLoops
-    law_parameters: tuple[str, ...] | None = None
-    """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
     amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
     """Standard errors of the peak amplitude, in nm, of each branch."""
     special_errors: Float[np.ndarray, " special"] | None = None
@@ -93,8 +89,6 @@ class Continuation(ResultTuple):
         what = f"orbit of {counted(self.impacts, 'impact')} in {order} drive periods"
         if self.impacts == 0:
             return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
-        if self.rejected:
-            return f"in every {what} {where} the tip would have to pass through the platform; try another order"
         return f"no {what} was found {where}, but a search may miss some; try another order or range"
 
     @property
@@ -110,8 +104,7 @@ def _point_rows(result: Continuation) -> list[dict[str, Any]]:
         for index, value in enumerate(branch.parameter.tolist()):
             row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
             if result.amplitude_errors is not None:
-                error = float(result.amplitude_errors[number][index])
-                row["peak_amplitude_error_nm"] = error if np.isfinite(error) else None
+                row["peak_amplitude_error_nm"] = float(result.amplitude_errors[number][index])
             rows.append(row)
     return rows
 
@@ -126,7 +119,6 @@ def _special_rows(result: Continuation) -> list[dict[str, Any]]:
             "branch": point.branch,
             "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
             "admissible": point.admissible,
-            "impacts": impact_rows(point.reading),
         }
         if result.special_errors is not None:
             error = float(result.special_errors[index])
@@ -146,11 +138,8 @@ def _(result: Continuation) -> dict[str, Any]:
         "second": None if result.second is None else result.second.path,
         "points": _point_rows(result),
         "special": _special_rows(result),
-        "curves": [
-            curve._asdict() | {"meetings": [meeting._asdict() for meeting in curve.meetings]} for curve in result.curves
-        ],
+        "curves": [curve._asdict() for curve in result.curves],
         "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in result.branches],
-        "law_parameters": result.law_parameters,
     }
 
 
@@ -176,10 +165,6 @@ def _(result: Continuation) -> list[Section]:
     for curve in result.curves:
         ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
         parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
-        parts += [
-            f"    {meeting.kind.replace('_', ' ')} at ({meeting.parameter:.6g}, {meeting.second:.6g})"
-            for meeting in curve.meetings
-        ]
     kind = f"({result.impacts}, {result.order}) orbits"
     return [Section(f"{'' if result.branches else 'No '}{kind} with {result.range}", parts)]
 
@@ -246,7 +231,7 @@ def continue_orbits(
             raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
     kind = ContactLoops if isinstance(scene.interaction, Contact) else LawLoops
     family = kind.of(scene, order, ranges[:1])
-    starts, rejected = _orbits_in_range(family, impacts, given)
+    starts = _orbits_in_range(family, impacts, given)
     speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
     family = replace(family, speed_unit=jnp.asarray(speed_unit))
     followed: list[FollowedCurve] = []
@@ -264,7 +249,7 @@ def continue_orbits(
     if second is not None:
         both = replace(kind.of(scene, order, ranges), speed_unit=family.speed_unit)
         curves = special_curves(special, both, second, parameter_values(scene)[second.path])
-    return Continuation(order, impacts, given, second, branches, special, curves, rejected, family)
+    return Continuation(order, impacts, given, second, branches, special, curves, family)
 
 
 def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRange]) -> None:
@@ -287,28 +272,19 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 raise ValueError(f"{given}: {problem}{hint}") from None
 
 
-def _orbits_in_range(
-    family: LoopFamily, impacts: int, given: ParameterRange
-) -> tuple[list[tuple[float, np.ndarray]], int]:
-    """Return orbits at some values in the range, and how many were left out as not admissible.
-
-    Each as the fraction of the range at which it is, and its loop in rad and nm/us.
-    """
-    value = parameter_values(family.scene)[given.path]
+def _orbits_in_range(family: LoopFamily, impacts: int, given: ParameterRange) -> list[tuple[float, np.ndarray]]:
+    """Return orbits at some values in the range: the fraction of the range, and the loop in rad and nm/us."""
+    value, width = parameter_values(family.scene)[given.path], given.high - given.low
     few = impacts > 1 or isinstance(family, ContactLoops)
     tried = np.linspace(0.0, 1.0, (3 if few else 9) + 2)[1:-1]
     # the middle first
     fractions = tried[np.argsort(np.abs(tried - 0.5), kind="stable")].tolist()
     if given.low <= value <= given.high:
-        fractions = [(value - given.low) / (given.high - given.low), *fractions]
+        fractions = [(value - given.low) / width, *fractions]
     if impacts == 0:
-        return [(fractions[0], np.zeros(0))], 0
-    orbits, rejected = [], 0
-    for fraction in fractions:
-        loops, passing = family.found(np.array([given.low + (given.high - given.low) * fraction]), impacts)
-        orbits += [(fraction, loop) for loop in loops]
-        rejected += passing
-    return orbits, rejected
+        return [(fractions[0], np.zeros(0))]
+    found = ((fraction, family.found(np.array([given.low + width * fraction]), impacts)) for fraction in fractions)
+    return [(fraction, loop) for fraction, loops in found for loop in loops]
 
 
 def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
@@ -317,7 +293,7 @@ def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
     for place in (0, -1):
         if ends[place] == "capture":
             leg = curve.legs[place]
-            root = root_on(leg, tested_by(CAPTURE, family), family)
+            root = root_on(leg, CAPTURE, family)
             # of the last step's way to capture: there the orbit still exists
             last = None if root is None else leg.at(root[0] + 1e-6 * (1 + place - root[0]), family)
             points[place] = (leg.end if place == 0 else leg.begin).point if last is None else last.point

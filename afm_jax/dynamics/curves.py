@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from afm_jax.dynamics.impact_loop import CAPTURE, FOLD, LoopFamily, rolled_states
 from afm_jax.solve.arclength import point_in_plane
-from afm_jax.solve.newton import Newton
 
 _LONGEST_STEP = 0.05
 """Steps along a curve: phases in rad, speeds of the fastest impact, parameters of their ranges."""
@@ -33,7 +32,7 @@ class CurvePoint(NamedTuple):
     tangent: Any
     """Unit vector along the curve."""
     tests: Any
-    """The five test functions, in the order of `KINDS`."""
+    """The test functions, in the order of `KINDS`."""
     delay: Any
     """Longest delay of an impact, in drive periods."""
 
@@ -41,7 +40,7 @@ class CurvePoint(NamedTuple):
 def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
     # steps in phases in rad, speeds of the fastest impact, parameters of their ranges
-    point = point_in_plane(family.linearised, guess, normal, Newton(rounds=12, step_tolerance=1e-11))
+    point = point_in_plane(family.linearised, guess, normal)
     return None if point is None else CurvePoint(point.x, point.tangent, *family.tests(point))
 
 
@@ -211,26 +210,25 @@ def lies_on(point: np.ndarray, curve: FollowedCurve, family: LoopFamily) -> bool
     return False
 
 
-def tested_by(test: int, family: LoopFamily) -> Callable[[CurvePoint], float]:
-    """Return the function from a point to the value of a test function by its number; 1 where it has none."""
-    along = test == FOLD and family.test is None
+def root_on(leg: CurveLeg, test: int, family: LoopFamily) -> tuple[float, CurvePoint] | None:
+    """Return where on a leg a test function is 0, as a fraction of the leg, and the point there; None: nowhere.
 
-    def value(point: CurvePoint) -> float:
-        tested = float(point.tangent[-1] if along else point.tests[test])
-        return tested if np.isfinite(tested) else 1.0
+    Args:
+        leg: of a curve in one parameter.
+        test: number of the function, which counts as 1 where it has no value.
+        family: of the curve's loops.
+    """
 
-    return value
-
-
-def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFamily) -> tuple[float, CurvePoint] | None:
-    """Return where on a leg a test function is 0, as a fraction of the leg, and the point there; None: nowhere."""
-    if not test(leg.begin) * test(leg.end) < 0.0:
-        return None
+    def tested(point: CurvePoint) -> float:
+        value = float(point.tangent[-1] if test == FOLD else point.tests[test])
+        return value if np.isfinite(value) else 1.0
 
     def tested_at(fraction: float) -> float:
         point = leg.at(fraction, family)
-        return np.nan if point is None else test(point)
+        return np.nan if point is None else tested(point)
 
+    if not tested(leg.begin) * tested(leg.end) < 0.0:
+        return None
     try:
         from scipy.optimize import brentq  # noqa: PLC0415  # half a second, seldom needed
 
@@ -240,4 +238,4 @@ def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFami
         return None
     point = leg.at(fraction, family)
     # a jump or a pole is no root
-    return None if point is None or not abs(test(point)) < AT_A_ROOT else (fraction, point)
+    return None if point is None or not abs(tested(point)) < AT_A_ROOT else (fraction, point)

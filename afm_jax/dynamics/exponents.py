@@ -19,7 +19,7 @@ from afm_jax.checks import checked
 from afm_jax.columns import CsvColumns, csv_columns
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import multipliers_of
-from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, Record, Tips, follow, next_departures
+from afm_jax.dynamics.many_tips import Record, Tips, follow, next_departures
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
@@ -30,7 +30,7 @@ from afm_jax.report import Section, sections
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.saved import as_json
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.solve.lanes import LANES, Report, in_blocks
+from afm_jax.solve.lanes import WIDTHS, Report, in_blocks
 from afm_jax.words import counted, with_error
 
 _PARTS = 20
@@ -46,7 +46,7 @@ class Lyapunov(ResultTuple):
             an impact to the end, before a tenth of the impacts were made.
         exponents_per_us: exponents per time, in 1/us; minus infinity and NaN where those per impact are.
         exponents_per_impact_error: standard errors from the means of twenty parts; of an orbit how far it may be off.
-        exponents_per_us_error: standard errors of the exponents in 1/us, likewise.
+        exponents_per_us_error: those over the mean time of an impact.
         impacts: how many the means are over.
         rested: how many of them ended in a rest.
         verdicts: what the motions have come to.
@@ -105,11 +105,8 @@ def _(result: Lyapunov) -> list[Section]:
     # the exponents of one motion with their errors; of many how many are positive
     larger, error = result.exponents_per_impact[..., 0], result.exponents_per_impact_error[..., 0]
     if np.ndim(result.impacts):
-        positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
-        unknown = int(np.sum(np.isnan(larger)))
-        what, others = result.along or counted(larger.size, "motion"), larger.size - unknown - positive
-        verdict = f"negative or undecided at {others}, unknown at {unknown}"
-        return [Section("", [f"{what}: the larger exponent is positive at {positive} values, {verdict}"])]
+        positive, what = int(np.sum(larger > CHAOTIC_ERRORS * error)), result.along or counted(larger.size, "motion")
+        return [Section("", [f"{what}: the larger exponent is positive at {positive} of {larger.size} values"])]
 
     def pair(values: np.ndarray, errors: np.ndarray) -> str:
         pairs = zip(values, errors, strict=True)
@@ -199,7 +196,7 @@ def lyapunov_spectrum(
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency; or a batch of scenes.
-        start: where the motion begins; None: one scene's default, of many `bouncing_tips`.
+        start: where the motion begins; None: `bouncing_tips`.
         impacts: impacts over which the exponents are taken.
         transient: impacts before.
         accuracy: of resolved contacts, as for `simulate`.
@@ -221,12 +218,11 @@ def lyapunov_spectrum(
     def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
         return _exponents_of_block(*lanes, impacts=impacts, transient=transient, accuracy=accuracy)
 
+    # impacts recorded together: of long motions a block holds fewer; no contact is simulated for copies of a lane
+    widths = [width for width in WIDTHS if width * impacts <= 2_000_000] or [1]
     if isinstance(scenes.interaction, Contact):
-        exponents = work((scenes, tips))
-    else:
-        # impacts recorded together: of long motions a block holds fewer
-        block = max(1, min(LANES, 1_200_000 // impacts))
-        exponents = in_blocks(work, (scenes, tips), block=block, report=report)
+        widths = [len(tips.time_us)]
+    exponents = in_blocks(work, (scenes, tips), widths=widths, report=report)
     return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
@@ -250,39 +246,28 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
         return of_impacts[:, -steps:].reshape(len(period), _PARTS + 1, each).sum(axis=2).T[1:]
 
     growth = parts(_growth_of(jacobians[:, -steps:]))
-    determinant = parts(np.log(np.abs(determinants)))
-    made, time_us = parts(np.isfinite(passed)), parts(np.nan_to_num(passed))
-    rested = parts(record.rested[:, 1:]).sum(axis=0)
-    forgotten = (verdicts.kind == MotionKind.STUCK) | (rested > 0)
+    both = np.stack([growth, parts(np.log(np.abs(determinants))) - growth], axis=-1)
+    made, rested = parts(np.isfinite(passed)), parts(record.rested[:, 1:]).sum(axis=0)
     orbit = verdicts.kind == MotionKind.ORBIT
-    measured = (made > 0).all(axis=0) & ~forgotten & (orbit | (verdicts.kind == MotionKind.IRREGULAR))
-    orbit &= measured
-    logs = np.stack([growth, determinant - growth], axis=-1)
-    of_orbits = _exponents_of_orbits(verdicts, jacobians, determinants)
-
-    def known(value: np.ndarray, forgets: float) -> np.ndarray:
-        return np.where(measured, value.T, np.where(forgotten, forgets, np.nan)).T
-
-    def mean_and_error(weight: np.ndarray, of_orbit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return exponents and errors per unit of a weight, which orbits have so much of for each impact."""
-        total = np.where(measured, weight.sum(axis=0), 1.0)[:, None]
-        mean = logs.sum(axis=0) / total
-        off = logs - mean * weight[..., None]
-        error = np.sqrt((off**2).sum(axis=0) * _PARTS / (_PARTS - 1)) / total
-        larger = np.argsort(-mean, axis=1)
-        mean, error = (np.take_along_axis(part, larger, axis=1) for part in (mean, error))
-        of_orbit = of_orbit[:, None]
-        mean = np.where(orbit[:, None], of_orbits / of_orbit, mean)
-        error = np.where(orbit[:, None], verdicts.remaining[:, None] / of_orbit, error)
-        return known(mean, -np.inf), known(error, 0.0)
-
-    per_impact = mean_and_error(made, np.ones(len(period)))
-    per_us = mean_and_error(time_us, verdicts.periods * period / np.maximum(verdicts.impacts, 1) + ~orbit)
+    forgotten = (verdicts.kind == MotionKind.STUCK) | (rested > 0)
+    measured = (made > 0).all(axis=0) & (orbit | (verdicts.kind == MotionKind.IRREGULAR))
+    count = np.where(measured, made.sum(axis=0), 1.0)
+    mean = both.sum(axis=0) / count[:, None]
+    error = np.sqrt(((both - mean * made[..., None]) ** 2).sum(axis=0) * _PARTS / (_PARTS - 1)) / count[:, None]
+    larger = np.argsort(-mean, axis=1)
+    mean, error = (np.take_along_axis(part, larger, axis=1) for part in (mean, error))
+    mean = np.where(orbit[:, None], _exponents_of_orbits(verdicts, jacobians, determinants), mean)
+    error = np.where(orbit[:, None], verdicts.remaining[:, None], error)
+    cases = [forgotten, measured]
+    per_impact, error = np.select(cases, [-np.inf, mean.T], np.nan).T, np.select(cases, [0.0, error.T], np.nan).T
+    # of an orbit the time that it repeats in
+    lasts_us = np.where(orbit, verdicts.periods * period, parts(np.nan_to_num(passed)).sum(axis=0))
+    pace_us = np.where(measured, lasts_us / np.where(orbit, verdicts.impacts, count), 1.0)[:, None]
     return Lyapunov(
-        exponents_per_impact=per_impact[0],
-        exponents_per_us=per_us[0],
-        exponents_per_impact_error=per_impact[1],
-        exponents_per_us_error=per_us[1],
+        exponents_per_impact=per_impact,
+        exponents_per_us=per_impact / pace_us,
+        exponents_per_impact_error=error,
+        exponents_per_us_error=error / pace_us,
         impacts=made.sum(axis=0),
         rested=rested,
         verdicts=verdicts,
@@ -312,20 +297,15 @@ def _linearised(
     The coordinates are drive phase and velocity (of contacts the rebound speed) over beta omega. Where there is no
     impact, or the tip rested before its departure, the Jacobian is 1.
     """
-    departure, velocity = record.departure_us[:, :-1], record.velocity_after_nm_per_us[:, :-1]
-    before = record.departure_periods[:, :-1]
-    passed, flown = (
-        (periods[:, 1:] - before) * period_us[:, None] + time[:, 1:]
-        for periods, time in (
-            (record.departure_periods, record.departure_us),
-            (record.arrival_periods, record.arrival_us),
-        )
-    )
-    there = np.isfinite(passed)
-    # both count from the beginning of the period of the departure
-    rows = [
-        np.where(there, part, 0.0) for part in (departure, velocity, passed, flown, record.approach_nm_per_us[:, 1:])
-    ]
+
+    def since(periods: np.ndarray, time_us: np.ndarray) -> np.ndarray:
+        # from the beginning of the period of the departure before
+        return (periods[:, 1:] - record.departure_periods[:, :-1]) * period_us[:, None] + time_us[:, 1:]
+
+    departure, passed = record.departure_us[:, :-1], since(record.departure_periods, record.departure_us)
+    flown, there = since(record.arrival_periods, record.arrival_us), np.isfinite(passed)
+    rows = departure, record.velocity_after_nm_per_us[:, :-1], passed, flown, record.approach_nm_per_us[:, 1:]
+    rows = [np.where(there, part, 0.0) for part in rows]
     if isinstance(scenes.interaction, Contact):
         jacobians = _contact_jacobians(scenes, *rows[:3], accuracy=accuracy)
         determinants, unit = np.linalg.det(jacobians), np.asarray(scenes.platform.top_speed_nm_per_us)
@@ -347,18 +327,14 @@ def _contact_jacobians(
     accuracy: float,
 ) -> Float[np.ndarray, "lanes steps 2 2"]:
     """Return the derivatives of next departures, d(phase, rebound speed) over d(phase, rebound speed) of these."""
-    column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], scenes)
-    omega = column.platform.angular_frequency
+    each = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+    omega, time = np.asarray(each.platform.angular_frequency), departure_us.ravel()
+    rebound = velocity_nm_per_us.ravel() - np.asarray(each.platform.velocity(time))
     # a thousandth of a free period after a departure no contact goes on, and the next one has not begun
-    until = next_departure_us + 1.0 / column.cantilever.frequency_khz
-    rebound = velocity_nm_per_us - column.platform.velocity(departure_us)
-    departures = jnp.stack([omega * departure_us, rebound], axis=-1).reshape(-1, 2)
-    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+    until = omega * (next_departure_us.ravel() + 1.0 / each.cantilever.frequency_khz)
 
-    def work(lanes: tuple[Scene, Array, Array]) -> Array:
-        return next_departures(*lanes, accuracy=accuracy)[1]
-
-    slopes = in_blocks(work, (of_all, departures, (omega * until).ravel()), block=CONTACTS_AT_ONCE)
+    lanes = each, np.stack([omega * time, rebound], axis=1), until
+    slopes = in_blocks(lambda some: next_departures(*some, accuracy=accuracy)[1], lanes, widths=WIDTHS[:-1])
     return slopes.reshape(*departure_us.shape, 2, 2)
 
 

@@ -36,8 +36,8 @@ from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import power_of_two
 from afm_jax.units import within_turn
 
-KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
-FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
+KINDS = ("fold", "period_doubling", "grazing", "capture")
+FOLD, DOUBLING, GRAZING, CAPTURE = range(len(KINDS))
 """Kinds of special points, by the numbers of the test functions that are 0 there (`LoopFamily.tests`)."""
 
 
@@ -325,7 +325,7 @@ class LoopFamily(eqx.Module):
     """Number of the test function that is 0 besides; None: none is."""
 
     @classmethod
-    def of(cls, scene: Scene, order: int, ranges: Sequence[ParameterRange] = (), **settings: Any) -> Any:
+    def of(cls, scene: Scene, order: int, ranges: Sequence[ParameterRange] = ()) -> Any:
         """Return the loops of one scene in N drive periods, over the ranges of some parameters; the unit is 1 nm/us.
 
         Raises:
@@ -337,11 +337,11 @@ class LoopFamily(eqx.Module):
         # for every period of the faster of drive and tip
         heights = power_of_two(math.ceil(32 * order * max(1.0, ratio)), 64)
         numbers = scene, jnp.asarray(float(order)), jnp.ones(()), low, high - low, paths, driven
-        return cls(*numbers, min(4096, heights), **settings)
+        return cls(*numbers, min(4096, heights))
 
     @abc.abstractmethod
-    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
-        """Return the loops of m impacts that a search finds, in rad and nm/us, and how many closed but do not fly.
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> Float[np.ndarray, "loops n"]:
+        """Return the loops of m impacts that a search finds and that the map flies, in rad and nm/us.
 
         Args:
             values: of the parameters.
@@ -364,7 +364,6 @@ class LoopFamily(eqx.Module):
 
             fold             1 - T + D; on curves in one parameter the tangent's component along it counts instead
             period_doubling  1 + T + D, a multiplier -1
-            torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
             grazing          the lowest point of a flight above the surface
             capture          the distance of the slowest impact from capture; without adhesion its speed
         """

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
-from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.checks import checked, require_float64
+from afm_jax.columns import rows_of
 from afm_jax.dynamics.impact_loop import (
     CAPTURE,
     ImpactLoop,
@@ -95,7 +96,7 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
     """Return the row of an orbit of several impacts: the numbers of the first, and all of them in `impacts`."""
     trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
     multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
-    impacts = impact_rows(reading, index)
+    impacts = rows_of({name: getattr(reading, name)[index] for name in IMPACT_COLUMNS})
     first = impacts[0] if impacts else dict.fromkeys(IMPACT_COLUMNS)
     return {
         "phase_rad": first["phase_rad"],
@@ -110,13 +111,6 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
     }
 
 
-def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
-    """Return the rows of the impacts of an orbit, one or several."""
-    columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
-    lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
-    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
-
-
 def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:
     """Say whether multipliers, the larger first, lie inside the unit circle."""
     return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
@@ -125,20 +119,20 @@ def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray,
 class LawLoops(LoopFamily):
     """Loops of a scene with a law, all of whose flights are closed forms."""
 
-    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
-        """Return loops of m impacts in rad and nm/us, and how many closed but do not fly; see `LoopFamily`."""
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> Float[np.ndarray, "loops n"]:
+        """Return loops of m impacts in rad and nm/us; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
         several = any(
             part is not None and part.second is not None for part in (scene.platform, scene.base, scene.force)
         )
         if impacts > 1 or several:
-            return many_impact_orbits(scene, order, impacts).loops, 0
+            return many_impact_orbits(scene, order, impacts).loops
         # all of them, close to capture too, where no start of a search stays
         orbits = single_impact_orbits(scene, order)
         admissible = np.asarray(orbits.exists & orbits.admissible)
         phases = np.asarray(orbits.phase_rad) - drive_of(scene).angular_frequency * np.asarray(orbits.delay_us)
         coordinates = np.asarray(impact_law_of(scene).coordinate(orbits.approach_speed_nm_per_us))
-        return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(orbits.exists) - admissible.sum())
+        return np.stack([phases, coordinates], axis=1)[admissible]
 
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
         """Return the closing conditions and the wanted test function at a point of a curve."""
@@ -162,7 +156,7 @@ class LawLoops(LoopFamily):
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
         some = points if len(points) else np.ones((1, points.shape[1]))
-        return jax.tree.map(lambda leaf: leaf[: len(points)], in_blocks(self._read, some, block=BLOCK, widths=()))
+        return jax.tree.map(lambda leaf: leaf[: len(points)], in_blocks(self._read, some, widths=(BLOCK,)))
 
     @jax.jit
     def _read(self, points: Float[Array, "points n"]) -> LoopReading:
@@ -197,7 +191,6 @@ class LawLoops(LoopFamily):
         return [
             1.0 - trace + determinant,
             1.0 + trace + determinant,
-            determinant - 1.0,
             near * loop.cantilever.angular_frequency / loop.speed_unit,
             slowest - loop.impact.lowest / loop.speed_unit,
         ]
@@ -218,14 +211,13 @@ def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
 
 
 @checked
-def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 512) -> ManyImpactOrbits:
-    """Return the orbits of m impacts in N drive periods that a search from many starts finds.
+def many_impact_orbits(scene: Scene, order: int, impacts: int) -> ManyImpactOrbits:
+    """Return the orbits of m impacts in N drive periods that a search from 512 starts finds.
 
     Args:
         scene: one scene with an `ImpactLaw`, driven with one period.
         order: N, drive periods until the motion repeats.
         impacts: m, impacts in them.
-        starts: how many flights the search begins with; more find more of the unstable orbits of a chaotic scene.
 
     Returns:
         The orbits, closed to 1e-11 of their speeds or better. Stable ones are found surely enough; of unstable ones
@@ -240,10 +232,9 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     require_float64(scene)
     impact_law_of(scene)
     check_loop(order, impacts)
-    check_count("starts", starts)
     top_speed = surface_of(scene)[0].top_speed_nm_per_us
     family = replace(LawLoops.of(scene, order), speed_unit=top_speed)
-    unknowns, closed = _search(family, jnp.asarray((0.5 + evenly_spread(starts)) % 1.0), impacts=int(impacts))
+    unknowns, closed = _search(family, jnp.asarray((0.5 + evenly_spread(512)) % 1.0), impacts=int(impacts))
     loops = loops_told_apart(np.asarray(unknowns)[np.asarray(closed)], order)
     reading = family.readings(loops)
     fly = reading.admissible & (reading.missing < _CLOSED)

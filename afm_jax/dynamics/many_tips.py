@@ -45,8 +45,6 @@ _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
 _ROWS = 40
 """Contacts of one stretch, which is one call of `simulate`."""
-CONTACTS_AT_ONCE = 128
-"""Contacts followed together, each with its derivatives."""
 
 
 class Tips(NamedTuple):

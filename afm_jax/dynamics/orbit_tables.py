@@ -7,8 +7,7 @@ one's numbers besides (`orbit_facts`).
 from typing import Any
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.columns import CsvColumns, columns_of, csv_columns
-from afm_jax.contact.contact import Contact
+from afm_jax.columns import CsvColumns, columns_of, csv_columns, rows_of
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
 from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.report import Cell, Section, Table, sections, table_of
@@ -39,33 +38,36 @@ class OrbitTable(ResultTuple):
         """The orbits that exist as plain numbers: by rising approach speed, or each with all its impacts."""
         if isinstance(self.orbits, ManyImpactOrbits):
             return [orbit_facts(self.orbits.reading, index) for index in range(len(self.orbits.stable))]
-        columns = {name: getattr(self.orbits, name).tolist() for name in self.columns}
-        slots = [slot for slot, exists in enumerate(self.orbits.exists.tolist()) if exists]
-        return [{name: values[slot] for name, values in columns.items()} for slot in slots]
+        rows = rows_of({name: getattr(self.orbits, name) for name in self.columns})
+        return [row for row, exists in zip(rows, self.orbits.exists.tolist(), strict=True) if exists]
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """What is told in a row of an orbit: attributes of orbits of such a scene; of several impacts the first's."""
+    def columns(self) -> list[str]:
+        """What a row of an orbit says: attributes of orbits of such a scene; of several impacts the first's."""
         if self.impacts is not None:
-            return (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
-        driven = (
-            *("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg", "peak_deflection_nm"),
-            *("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
-            *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg", "extrapolated"),
-        )
-        return (
-            *(*IMPACT_COLUMNS, "peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
-            *("trace", "determinant", "stable", "admissible", "near_double"),
-            *(name for name in driven if getattr(self.orbits, name) is not None),
-        )
+            return [*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible"]
+        numbers = {name for name, values in vars(self.orbits).items() if values is not None} - {"exists", "complete"}
+        return [*IMPACT_COLUMNS, *sorted(numbers - {*IMPACT_COLUMNS})]
 
     @property
     def reason(self) -> str | None:
-        """Why no orbit is admissible; None where one is."""
-        rows = self.rows
+        """Why no orbit is admissible, and what to try; None where one is."""
+        rows, scene, order = self.rows, self.scene, self.order
         if any(orbit["admissible"] for orbit in rows):
             return None
-        return why_none(self.scene, self.order, rejected=len(rows), impacts=self.impacts or 1)
+        if float(getattr(scene.interaction, "r", 1.0)) == 0.0:
+            return "with r = 0 every impact is a capture and no orbit leaves; `afm-jax simulate` follows the tip"
+        if self.impacts is not None:
+            what = f"no orbit of {counted(self.impacts, 'impact')} in {counted(order, 'drive period')} was found"
+            return f"{what}, but the search may miss some: `afm-jax simulate` shows what the tip comes to from a start"
+        reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
+        nearest = max(1, round(reduced))
+        what = f"there is no orbit of order {order}"
+        if rows:
+            what = f"in every orbit of order {order} the tip would have to pass through the platform"
+        if nearest != order:
+            return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try `order={nearest}`"
+        return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"
 
     @property
     def impact_speeds_nm_per_us(self) -> list[float]:
@@ -126,34 +128,3 @@ def _(table: OrbitTable) -> CsvColumns:
         "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], table.columns),
         "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
     }
-
-
-def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> str:
-    """Return a sentence on why a scene has no admissible orbit of an order, and what to try.
-
-    Args:
-        scene: the scene.
-        order: N, drive periods between impacts.
-        rejected: how many orbits would close if the tip could pass through the platform.
-        impacts: m, impacts in an orbit.
-    """
-    if float(getattr(scene.interaction, "r", 1.0)) == 0.0:
-        return "with r = 0 every impact is a capture: no orbit leaves the sample; `afm-jax simulate` follows the tip"
-    if isinstance(scene.interaction, Contact):
-        return (
-            f"the search found no orbit of {counted(impacts, 'impact')} in {counted(order, 'drive period')}; of a "
-            "contact it may miss some: `afm-jax simulate` shows what the tip comes to from a start"
-        )
-    if impacts > 1:
-        return (
-            f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "
-            "`afm-jax continue` say where orbits of one impact double their period"
-        )
-    reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
-    nearest = max(1, round(reduced))
-    what = f"there is no orbit of order {order}"
-    if rejected:
-        what = f"in every orbit of order {order} the tip would have to pass through the platform"
-    if nearest != order:
-        return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try `order={nearest}`"
-    return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"

@@ -4,29 +4,17 @@ A special point is where a test function changes its sign between two points, lo
 In two parameters the closing equations together with the test function are followed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.dynamics.curves import (
-    AT_A_ROOT,
-    CurveLeg,
-    CurvePoint,
-    FollowedCurve,
-    followed_both_ways,
-    lies_on,
-    root_on,
-    tested_by,
-)
-from afm_jax.dynamics.impact_loop import CAPTURE, DOUBLING, FOLD, GRAZING, KINDS, TORUS, LoopFamily, LoopReading
+from afm_jax.dynamics.curves import AT_A_ROOT, CurvePoint, FollowedCurve, followed_both_ways, lies_on, root_on
+from afm_jax.dynamics.impact_loop import CAPTURE, GRAZING, KINDS, LoopFamily, LoopReading
 from afm_jax.scenefile.parameter_paths import ParameterRange
-
-_ASIDE = 1e-5
-"""Of a step between points: how far to either side of a grazing or a capture is looked."""
 
 
 class SpecialPoint(NamedTuple):
@@ -37,8 +25,6 @@ class SpecialPoint(NamedTuple):
     parameter: float
     branch: int
     """Number of the branch that it lies on."""
-    position: float
-    """Where on it, in points: 2.5 is between the third and the fourth."""
     admissible: bool
     """Whether the map flies the orbit (at a grazing and a capture: on one side)."""
     point: Float[np.ndarray, " n"]
@@ -59,14 +45,6 @@ class OrbitBranch(NamedTuple):
     """Why it ends there, at either end."""
 
 
-class Meeting(NamedTuple):
-    """A point of a curve in two parameters that is special in two ways, or where the curve has a cusp."""
-
-    kind: str
-    parameter: float
-    second: float
-
-
 class SpecialCurve(NamedTuple):
     """A special point followed through two parameters."""
 
@@ -74,7 +52,6 @@ class SpecialCurve(NamedTuple):
     parameter: Float[np.ndarray, " points"]
     second: Float[np.ndarray, " points"]
     admissible: np.ndarray
-    meetings: tuple[Meeting, ...]
     ends: tuple[str, str]
 
 
@@ -86,7 +63,7 @@ class _Root(NamedTuple):
     test: int
     point: CurvePoint
     seen: list[np.ndarray]
-    """Points whose orbits are read: that of the root first, then its neighbours on either side."""
+    """Points whose orbits are read: that of the root first, then the curve's points on either side."""
 
 
 def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> list[SpecialPoint]:
@@ -108,7 +85,7 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
             continue
         at = root.point.point
         parameter = low + width * float(at[-1])
-        point = SpecialPoint(kind, parameter, number, root.position, admissible, at, reading, root.test)
+        point = SpecialPoint(kind, parameter, number, admissible, at, reading, root.test)
         # of the range
         near = special and abs(special[-1].parameter - parameter) < 1e-7 * width
         if near and special[-1].kind == kind:
@@ -124,23 +101,12 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
     roots = []
     for number, leg in enumerate(curve.legs):
         for test in range(len(KINDS)):
-            root = root_on(leg, tested_by(test, family), family)
+            root = root_on(leg, test, family)
             if root is None:
                 continue
             fraction, point = root
-            # multipliers that are a complex pair, given D = 1: |T| < 2
-            if test == TORUS and not abs(float(point.tests[DOUBLING] - point.tests[FOLD])) < 4.0:
-                continue
-            position = number + fraction
-            if test == CAPTURE:
-                # there the branch ends: its last point is beside it
-                position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
-            seen = [point]
-            if test in (GRAZING, CAPTURE):
-                # on one side the orbit may be flown
-                beside = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
-                seen += [each for each in beside if each is not None]
-            roots.append(_Root(position, test, point, [each.point for each in seen]))
+            # of a grazing or a capture the map flies one side alone
+            roots.append(_Root(number + fraction, test, point, [each.point for each in (point, leg.begin, leg.end)]))
     return roots
 
 
@@ -186,11 +152,10 @@ def special_curves(
     followed: list[tuple[int, FollowedCurve]] = []
     curves = []
     for point in special:
-        if not point.admissible:
-            continue
         start = np.append(point.point, (value - second.low) / (second.high - second.low))
         with_test = replace(family, test=point.test)
-        if any(lies_on(start, curve, with_test) for test, curve in followed if test == point.test):
+        others = (curve for test, curve in followed if test == point.test)
+        if not point.admissible or any(lies_on(start, curve, with_test) for curve in others):
             continue
         curve = followed_both_ways(start, with_test)
         if curve is not None:
@@ -200,34 +165,11 @@ def special_curves(
 
 
 def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> SpecialCurve:
-    low, width = np.asarray(family.low), np.asarray(family.width)
-    # an impact without speed, or of a captured tip, has no linearised map
-    others = [GRAZING] if family.test == CAPTURE else [test for test in range(len(KINDS)) if test != family.test]
-    meetings = []
-    for leg in curve.legs:
-        functions: list[tuple[int | None, Any]] = [(test, tested_by(test, family)) for test in others]
-        if family.test == FOLD:
-            functions.append((None, _cusp_function(leg)))
-        for test, function in functions:
-            root = root_on(leg, function, family)
-            if root is None:
-                continue
-            name = "cusp" if test is None else f"{kind}_{_kind_of(test, root[1], family)}"
-            # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
-            if name != f"{kind}_{kind}":
-                meetings.append(Meeting(name, *(low + width * root[1].point[-2:]).tolist()))
-    values = low + width * curve.points[:, -2:]
+    values = np.asarray(family.low) + np.asarray(family.width) * curve.points[:, -2:]
     if family.test in (GRAZING, CAPTURE):
         # they are the border of what the map flies: only the other border can be passed
         other = np.array([point.tests[GRAZING + CAPTURE - family.test] for point in curve.steps])
         admissible = ~(other < -AT_A_ROOT)
     else:
         admissible = np.asarray(family.readings(curve.points).admissible)
-    return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), curve.ends)
-
-
-def _cusp_function(leg: CurveLeg) -> Callable[[CurvePoint], float]:
-    """Return the test function of cusps: where both parameters turn round, their part of the tangent vanishes."""
-    direction = leg.begin.tangent[-2:]
-    direction = direction / np.linalg.norm(direction)
-    return lambda point: float(point.tangent[-2:] @ direction)
+    return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, curve.ends)

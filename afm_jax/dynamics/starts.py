@@ -17,14 +17,14 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, after_impacts
-from afm_jax.impact.law import Law, impact_law_of
+from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start, gap_of_departure, rebound_of_leaving
+from afm_jax.motion.start import gap_of_departure, rebound_of_leaving
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import WIDTHS, in_blocks
 
 
 class SampleDriven(NamedTuple):
@@ -85,13 +85,12 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
 
     Args:
         scene: one scene, or a batch of scenes.
-        start: the tip in the lab; None: `default_start` of one scene, of many `bouncing_tips`.
+        start: the tip in the lab; None: `bouncing_tips`.
 
     Raises:
         ValueError: if the tip cannot start there.
     """
     if scene.platform.frequency_khz.ndim == 0:
-        start = default_start(scene) if start is None else start
         scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
     if start is None:
         return scene, bouncing_tips(scene)
@@ -139,23 +138,25 @@ def leaving_tips(scenes: Scene) -> Tips:
 def bouncing_tips(scenes: Scene) -> Tips:
     """Return tips where there is motion: on the stable single-impact orbit of the order nearest to resonance.
 
-    The fastest one if there are several; of a contact that of the law closest to it. Where there is none the tip is one
-    of `leaving_tips`.
+    The fastest one if there are several; of contacts that of the law closest to the first one. Where there is none the
+    tip is one of `leaving_tips`.
 
     Args:
         scenes: a batch of scenes, driven by the sample alone.
     """
-    usual, gap = leaving_tips(scenes), gap_of_departure(scenes)
-    laws = laws_of(scenes)
-    if laws is None:
-        return usual
-    law, has_law = laws
+    usual, gap, law = leaving_tips(scenes), gap_of_departure(scenes), scenes.interaction
+    if isinstance(law, Contact):
+        contact, mass = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (law, scenes.cantilever.mass_ng))
+        law = approximate_law(contact, float(mass))
+        if law is None:
+            return usual
+        law = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(gap), *leaf.shape)), law)
 
     def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
         return _on_orbits(*lanes)
 
-    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=128)
-    return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
+    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), widths=WIDTHS[:-1])
+    return jax.tree.map(lambda on_orbit, elsewhere: np.where(there, on_orbit, elsewhere), tips, usual)
 
 
 @jax.jit
@@ -176,28 +177,6 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
 
     there, time, velocity = jax.vmap(on_orbit_of)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=clearance_nm)
-
-
-def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
-    """Return a batch of laws, those closest to the contacts of scenes with one, and where there is one; None: nowhere.
-
-    Args:
-        scenes: a batch of scenes.
-    """
-    if not isinstance(scenes.interaction, Contact):
-        return impact_law_of(scenes), np.ones(len(scenes.platform.frequency_khz), bool)
-    columns = [np.asarray(leaf) for leaf in (*jax.tree.leaves(scenes.interaction), scenes.cantilever.mass_ng)]
-    _, first, owner = np.unique(np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True)
-    each = []
-    for lane in first:
-        contact = jax.tree.map(lambda leaf, lane=lane: jnp.asarray(leaf)[lane], scenes.interaction)
-        each.append(approximate_law(contact, float(columns[-1][lane])))
-    some = next((law for law in each if law is not None), None)
-    if some is None:
-        return None
-    has_law = np.array([law is not None for law in each])[owner.ravel()]
-    laws = jax.tree.map(lambda *parts: jnp.stack(parts), *(some if law is None else law for law in each))
-    return jax.tree.map(lambda leaf: leaf[owner.ravel()], laws), has_law
 
 
 @jax.jit

@@ -1,6 +1,7 @@
 """How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample."""
 
 import enum
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips, follow
 from afm_jax.motion.settle import LONGEST, ROUNDING, find_repetitions
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import LANES, WIDTHS, Report, in_blocks
+from afm_jax.solve.lanes import WIDTHS, Report, in_blocks
 
 
 class MotionKind(enum.IntEnum):
@@ -84,8 +85,7 @@ def motions_of(
     tips: Tips,
     impacts: int,
     *,
-    accuracy: float,
-    block: int = LANES,
+    widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
 ) -> Motions:
     """Return what tips come to after some impacts.
@@ -94,15 +94,14 @@ def motions_of(
         scenes: of the tips, a batch.
         tips: at the beginning of a flight each.
         impacts: how many, those recorded included.
-        accuracy: of resolved contacts.
-        block: lanes that are followed together; fewer than usual are always so many, in one program.
+        widths: numbers of lanes that are followed together, as of `in_blocks`.
         report: called with how many of how many tips are done.
     """
 
     def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
-        return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=accuracy)
+        return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=1e-6)
 
-    end, record = in_blocks(work, (scenes, tips), block=block, widths=WIDTHS if block == LANES else (), report=report)
+    end, record = in_blocks(work, (scenes, tips), widths=widths, report=report)
     tolerance = 1e-4 if isinstance(scenes.interaction, Contact) else 1e-6
     period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
     return Motions(end, record, verdicts_of(record, end.outcome, period, tolerance=tolerance))

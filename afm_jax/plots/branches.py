@@ -17,7 +17,6 @@ from afm_jax.units import TWO_SIDED_95
 _MARKS = {
     "fold": ("o", "black"),
     "period_doubling": ("s", "#009E73"),
-    "torus": ("D", "#CC79A7"),
     "grazing": ("^", "#56B4E9"),
     "capture": ("v", DARK),
 }
@@ -75,7 +74,7 @@ def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " point
 
 
 def curves_figure(found: Continuation) -> Figure:
-    """Return the curves of special points in two parameters, with cusps and meetings marked.
+    """Return the curves of special points in two parameters.
 
     Args:
         found: what is shown.
@@ -97,9 +96,6 @@ def curves_figure(found: Continuation) -> Figure:
             if np.isfinite(shown).any():
                 name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
                 axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=name)
-        for one in curve.meetings:
-            marker, name = ("*", "cusp") if one.kind == "cusp" else ("X", "codimension two")
-            axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))

@@ -139,7 +139,7 @@ def exponents_figure(found: Lyapunov) -> Figure:
 
 
 def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "height") -> Figure:
-    """Return a bifurcation diagram: what its impacts are like, and the tip's height whenever the drive's phase is 0.
+    """Return a bifurcation diagram: what its impacts are like.
 
     Where the motion ended the ground has the ramp's colour; where a verdict's probability is below 95 % it is grey.
 
@@ -154,26 +154,24 @@ def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "heig
         raise ValueError(f"`ordinate` must be one of {', '.join(_ORDINATES)}, but is {ordinate!r}")
     attribute, label = _ORDINATES[ordinate]
     sweeps, path = ([ramped], "") if isinstance(ramped, BifurcationDiagram) else (ramped.sweeps, ramped.parameter)
-    figure, panels = new_panels(9.0, 8.0, 2, sharex=True)
+    figure, axes = new_panels(9.0, 4.8)
     for sweep in sweeps:
         colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
         size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [8.0, 5.0, 4.0, 1.0]))
-        for axes, part in zip(panels, (getattr(sweep, attribute), sweep.strobe_height_nm), strict=True):
-            there = np.isfinite(part)
-            at = np.repeat(sweep.values, there.sum(axis=1))
-            axes.plot(at, part[there], ".", color=colour, mew=0.0, ms=size, alpha=0.5, label=word, rasterized=True)
-            for kind, (what, hatch) in _ENDED.items():
-                _shade(axes, sweep, sweep.verdicts.kind == kind, color=colour, hatch=hatch, label=f"{word}: {what}")
+        part = getattr(sweep, attribute)
+        there = np.isfinite(part)
+        at = np.repeat(sweep.values, there.sum(axis=1))
+        axes.plot(at, part[there], ".", color=colour, mew=0.0, ms=size, alpha=0.5, label=word, rasterized=True)
+        for kind, (what, hatch) in _ENDED.items():
+            _shade(axes, sweep, sweep.verdicts.kind == kind, color=colour, hatch=hatch, label=f"{word}: {what}")
         if sweep.verdict_probability is not None:
-            for axes in panels:
-                _shade(axes, sweep, sweep.verdict_probability < _SURE, color=GRID, label="verdict uncertain")
-    label_axes(panels[0], x="", y=label)
-    label_axes(panels[1], x=label_of(path) if path else "parameter", y="height at drive phase 0 (nm)")
+            _shade(axes, sweep, sweep.verdict_probability < _SURE, color=GRID, label="verdict uncertain")
+    label_axes(axes, x=label_of(path) if path else "parameter", y=label)
     # also where the tip is stuck and there is nothing to draw
     ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
     margin = 0.5 * (max(ends) - min(ends)) / len(sweeps[0].values)
-    panels[0].set_xlim(min(ends) - margin, max(ends) + margin)
-    legend_once(panels[0], figure, **_ABOVE | {"ncols": 2})
+    axes.set_xlim(min(ends) - margin, max(ends) + margin)
+    legend_once(axes, figure, **_ABOVE | {"ncols": 2})
     return figure
 
 

@@ -13,6 +13,8 @@ from jaxtyping import Float
 
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
+_CLOSING = Newton(rounds=12, step_tolerance=1e-11)
+
 
 class EquationsAt(NamedTuple):
     """The equations of a curve at a point."""
@@ -38,7 +40,6 @@ def point_in_plane(
     equations: Callable[[Float[np.ndarray, " unknowns"]], EquationsAt | None],
     guess: Float[np.ndarray, " unknowns"],
     normal: Float[np.ndarray, " unknowns"],
-    settings: Newton,
 ) -> PointInPlane | None:
     """Return where a curve meets the plane through a guess across a normal; None where Newton's method finds no point.
 
@@ -46,7 +47,6 @@ def point_in_plane(
         equations: the equations and their derivatives at a point; None where they have no value.
         guess: point near the curve, in the plane.
         normal: of the plane.
-        settings: of Newton's method.
     """
 
     def bordered(points: Float[np.ndarray, "1 unknowns"], _: Any) -> LinearisedRows:
@@ -54,10 +54,12 @@ def point_in_plane(
         if here is None:
             return LinearisedRows(np.full_like(points, np.nan), np.full((1, len(guess), len(guess)), np.nan))
         residual = np.append(here.residual, normal @ (points[0] - guess))
-        return LinearisedRows(residual[None], np.vstack([here.slopes, normal])[None], [here.details])
+        slopes = np.vstack([here.slopes, normal])
+        return LinearisedRows(residual[None], slopes[None], [(slopes, here.details)])
 
-    root = newton_rows(bordered, guess[None], settings)
+    root = newton_rows(bordered, guess[None], _CLOSING)
     if not root.converged[0]:
         return None
-    along = np.linalg.solve(root.slopes[0], np.eye(len(guess))[-1])
-    return PointInPlane(root.x[0], along / np.linalg.norm(along), root.details[0])
+    slopes, details = root.details[0]
+    along = np.linalg.solve(slopes, np.eye(len(guess))[-1])
+    return PointInPlane(root.x[0], along / np.linalg.norm(along), details)

@@ -160,12 +160,7 @@ def slope_of(function: Callable[[Array], Array], at: Float[Array, "..."]) -> Flo
 
 def value_and_slopes(function: Callable[[Array], Array], at: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return the value of a function of some numbers, and its derivatives by each, which come last."""
-
-    def twice(at: Array) -> tuple[Array, Array]:
-        value = function(at)
-        return value, value
-
-    slopes, value = jax.jacfwd(twice, has_aux=True)(at)
+    slopes, value = jax.jacfwd(lambda at: (function(at),) * 2, has_aux=True)(at)
     return value, slopes
 
 

@@ -48,7 +48,6 @@ def in_blocks(
     work: Callable[[Any], Any],
     lanes: Any,
     *,
-    block: int = LANES,
     widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
 ) -> Any:
@@ -59,12 +58,11 @@ def in_blocks(
     Args:
         work: takes a tree of JAX arrays with a leading axis of lanes, gives one of arrays with the same axis.
         lanes: the tree of all lanes, at least one.
-        block: lanes of a block; of fewer lanes there is one smaller block.
-        widths: sizes that a smaller block may have, in ascending order.
+        widths: lanes of a block, in ascending order: the first that holds all lanes, or the last.
         report: called with how far it is, from the second block on.
     """
     count = len(jax.tree.leaves(lanes)[0])
-    width = min(block, next((width for width in widths if width >= count), block))
+    width = next((width for width in widths if width >= count), widths[-1])
     whole = jax.tree.map(np.asarray, lanes)
 
     def part(first: int) -> Any:

@@ -5,7 +5,7 @@ implicit function theorem, dx/dp = -(df/dx)^-1 df/dp. `newton_rows` solves for m
 program, such as a simulation: each round evaluates the rows that are still open, and no others.
 
 In a batch of slots with few guesses `where` names the slots that hold one. A step that must not leave the domain
-of f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
+of f is limited by `Newton.damping`.
 """
 
 import math
@@ -37,18 +37,11 @@ class Newton(NamedTuple):
     """Natural size of the unknowns at x, to which `step_tolerance` refers; None: 1."""
     damping: Callable[[Any, Any], Any] | None = None
     """Returns the step to be taken from x in place of the full one; None: the full step."""
-    halvings: int = 0
-    """How often a step is halved that does not lower the norm of the residual (`newton_rows` alone)."""
 
     def limited(self, x: Any, step: Any) -> tuple[Any, Any]:
         """Return the step to be taken from x, and the sizes of its components."""
         step = step if self.damping is None else self.damping(x, step)
         return step, abs(step if self.unit is None else step / self.unit(x))
-
-
-def shortened(step: Any, longest: Any) -> Any:
-    """Return a step in its own direction, at most so long that every component is within `longest`."""
-    return step / abs(step / longest).max(axis=-1, keepdims=True).clip(1.0)
 
 
 class Root(NamedTuple):
@@ -123,8 +116,6 @@ class Roots(NamedTuple):
     x: Float[np.ndarray, "rows n"]
     converged: Bool[np.ndarray, " rows"]
     """Which rows have a root: the last step and the residual before it are within their tolerances."""
-    slopes: Float[np.ndarray, "rows n n"]
-    """Derivatives of the residuals before the last step; NaN where there are none."""
     details: list[Any]
     """What the last evaluation of each row has found besides; None where there is nothing."""
 
@@ -141,38 +132,22 @@ def newton_rows(
         guesses: first points.
         settings: rounds, tolerances and limits.
     """
-    count, unknowns = np.shape(guesses)
-    roots = Roots(
-        x=np.array(guesses, float),
-        converged=np.zeros(count, bool),
-        slopes=np.full((count, unknowns, unknowns), np.nan),
-        details=[None] * count,
-    )
-    step = np.zeros((count, unknowns))
-    lowest = np.full(count, np.inf)
-    halved = np.zeros(count, int)
+    count = len(guesses)
+    roots = Roots(np.array(guesses, float), np.zeros(count, bool), [None] * count)
     rows = np.arange(count)
     for _ in range(settings.rounds):
         if not rows.size:
             break
         here = linearised(roots.x[rows], rows)
-        size = np.linalg.norm(here.residual, axis=1)
-        too_far = ~(size < lowest[rows]) if settings.halvings else np.zeros(len(rows), bool)
-        full, sizes = settings.limited(roots.x[rows], -_solved(here.slopes, here.residual))
-        finite = np.isfinite(full).all(axis=1)
+        step, sizes = settings.limited(roots.x[rows], -_solved(here.slopes, here.residual))
+        finite = np.isfinite(step).all(axis=1)
         small = np.all(np.abs(here.residual) <= settings.residual_tolerance, axis=1)
         found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)
-        roots.converged[rows] = found & ~too_far
-        roots.slopes[rows[~too_far]] = here.slopes[~too_far]
         for row, detail in zip(rows, here.details or (), strict=bool(here.details)):
             roots.details[row] = detail
-        # a step that does not lower the norm is taken back by half
-        step[rows] = np.where(too_far[:, None], 0.5 * step[rows], np.where(finite[:, None], full, 0.0))
-        roots.x[rows] += np.where(too_far[:, None], -step[rows], step[rows])
-        lowest[rows], halved[rows] = np.fmin(size, lowest[rows]), np.where(too_far, halved[rows] + 1, 0)
-        given_up = rows[halved[rows] > settings.halvings]
-        roots.x[given_up] -= step[given_up]
-        rows = np.setdiff1d(rows[too_far | finite & ~found], given_up)
+        roots.converged[rows] = found
+        roots.x[rows[finite]] += step[finite]
+        rows = rows[finite & ~found]
     return roots
 
 

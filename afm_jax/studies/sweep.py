@@ -274,7 +274,7 @@ def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
 def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...] = (1,)) -> Recorder:
     """Record the stable single-impact orbits of scenes; of several of one order the highest."""
     if isinstance(scene.interaction, Contact):
-        raise ValueError("'orbits' are those of laws: for a resolved contact record 'simulation', or make a chart")  # noqa: TRY004
+        raise ValueError("'orbits' are those of laws: `afm-jax collide --make-law` gives that of a contact")  # noqa: TRY004
     sample_driven(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
@@ -296,7 +296,7 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...] = (
     points = 4096 if impact_law_of(scene).delay else 1 << 18
     # what a processor's cache holds, or what fills an accelerator; blocks of one shape have one program
     block = 1024 if jax.default_backend() == "cpu" else 1 << 16
-    work = partial(in_blocks, jax.jit(record_batch), block=block, widths=(block,))
+    work = partial(in_blocks, jax.jit(record_batch), widths=(block,))
     return Recorder(work, points, ("peak_amplitude_nm", "stable_orbits"), {"order": orders})
 
 
@@ -355,7 +355,7 @@ def _lyapunov(
         return results
 
     # blocks of one width, so that there is one shape of every program
-    work = partial(in_blocks, record, block=lanes, widths=(lanes,))
+    work = partial(in_blocks, record, widths=(lanes,))
     points, words = lanes if resolved else 4 * lanes, {"kind": _codes(MotionKind)}
     return Recorder(work, points, exponents[:2], {"exponent": (1, 2)}, words, alone=resolved)
 

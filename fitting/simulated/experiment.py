@@ -129,7 +129,7 @@ def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Flo
     program = jax.jit(jax.vmap(one))
     rows = np.arange(len(drives.order))
     lanes = (_platform(drives, rows), drives.order.astype(float))
-    starts, found = in_blocks(lambda some: program(*some), lanes, block=BATCH, widths=())
+    starts, found = in_blocks(lambda some: program(*some), lanes, widths=(BATCH,))
     return np.array(starts.T), found
 
 
@@ -159,7 +159,7 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
     def follow(starts: np.ndarray, rows: np.ndarray) -> Simulation:
         durations = drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
         lanes = (_platform(drives, rows), State(*starts), durations)
-        return in_blocks(lambda some: program(interaction, cantilever, *some), lanes, block=BATCH, widths=())
+        return in_blocks(lambda some: program(interaction, cantilever, *some), lanes, widths=(BATCH,))
 
     return follow
 

@@ -22,7 +22,7 @@ from fitting.tapping_curves.curve import Given, Instrument, Mask, Rows, TappingC
 
 _STEPS = 1e-5 * np.eye(3)[:, :, None]
 """Of differences by the unknowns, in units of their own."""
-_CLOSING = Newton(rounds=120, residual_tolerance=5e-10, halvings=6)
+_CLOSING = Newton(rounds=120, residual_tolerance=5e-10)
 """Of the free amplitude, each of three equations: 1e-9 together."""
 
 
