@@ -19,7 +19,7 @@ def bifurcation(  # noqa: PLR0913
     both: bool = False,
     down: bool = False,
     impacts: Annotated[int, IntRange(200)] = 2000,
-    ordinate: Literal["height", "phase", "impact_speed"] = "height",
+    ordinate: Literal["height", "phase", "impact_speed"] | None = None,
     draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
     """Ramp a parameter and record the motion on which the tip settles at each of its values.
@@ -39,7 +39,7 @@ def bifurcation(  # noqa: PLR0913
         both: ramp up and then down, so that hysteresis shows.
         down: ramp down instead of up.
         impacts: impacts at every value.
-        ordinate: what the picture draws of an impact.
+        ordinate: what the picture draws of an impact; else the height, over a sample at rest the impact speed.
         draws: laws drawn from the fit for the bands.
     """
     (swept,) = ranges_of(scene, [parameter], counted=True)

@@ -138,22 +138,26 @@ def exponents_figure(found: Lyapunov) -> Figure:
     return figure
 
 
-def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "height") -> Figure:
+def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str | None = None) -> Figure:
     """Return a bifurcation diagram: what its impacts are like.
 
     Where the motion ended the ground has the ramp's colour; where a verdict's probability is below 95 % it is grey.
 
     Args:
         ramped: one ramp of a parameter, or up and down; where both are, the one down lies over the one up.
-        ordinate: of the impacts: "height" of the platform, drive "phase" or "impact_speed" relative to the platform.
+        ordinate: of the impacts: "height" of the platform, drive "phase" or "impact_speed" relative to the platform;
+            None: the height, but the impact speed where the platform rests.
 
     Raises:
         ValueError: if there is no such ordinate.
     """
+    sweeps, path = ([ramped], "") if isinstance(ramped, BifurcationDiagram) else (ramped.sweeps, ramped.parameter)
+    if ordinate is None:
+        rests = all(len(np.unique(row[np.isfinite(row)])) <= 1 for sweep in sweeps for row in sweep.height_nm)
+        ordinate = "impact_speed" if rests else "height"
     if ordinate not in _ORDINATES:
         raise ValueError(f"`ordinate` must be one of {', '.join(_ORDINATES)}, but is {ordinate!r}")
     attribute, label = _ORDINATES[ordinate]
-    sweeps, path = ([ramped], "") if isinstance(ramped, BifurcationDiagram) else (ramped.sweeps, ramped.parameter)
     figure, axes = new_panels(9.0, 4.8)
     for sweep in sweeps:
         colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
