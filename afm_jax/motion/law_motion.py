@@ -233,6 +233,18 @@ class Bed(NamedTuple):
         """Return the push in nm/us^2 and its rate in nm/us^3."""
         return jax.jvp(self.push, (time_us,), (jnp.ones_like(time_us),))
 
+    def time_pressed(self, time_us: Float[Array, ""]) -> Float[Array, ""]:
+        """Return infinity where the push stays positive after a time in us, whatever the phase of the waves, else 0."""
+        surface = self.surface
+        decay = self.cantilever.decay_rate
+        square = self.cantilever.angular_frequency**2
+        rate, reach = surface.offset_rate_nm_per_us, surface.reach_nm
+        waves = surface.largest_acceleration_nm_per_us2 + (
+            2.0 * decay * surface.fastest_angular_frequency * reach + square * reach
+        )
+        least = square * (surface.offset_nm + rate * time_us) + 2.0 * decay * rate - waves
+        return jnp.where((least >= 0.0) & (rate >= 0.0), jnp.inf, 0.0)
+
 
 def first_release(
     bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""]
@@ -266,7 +278,7 @@ def first_release(
         met = step <= jnp.maximum(DEFAULT_ROOT_TOLERANCE_US, resolution * jnp.abs(time))
         lifted = met & ((rate < -bend * shortest) | (push < -bend * shortest**2))
         step = jnp.where(met & ~lifted, shortest, step)
-        return time + step, lifted, steps + 1
+        return time + jnp.maximum(step, still.time_pressed(time)), lifted, steps + 1
 
     none = jnp.zeros_like(begin, dtype=bool)
     time, lifted, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
