@@ -82,8 +82,9 @@ def off_a_line(quality_factor: float) -> np.ndarray:
     for gap in gaps:
         scene = dimensionless_scene(1.0, 0.5 / quality_factor, 0.7, gap=float(gap), force=1.0 / quality_factor)
         orbits = single_impact_orbits(scene, 1)
-        both = np.stack([orbits.drive_lockin_amplitude_nm, np.sin(np.radians(orbits.phase_lag_deg))])
-        (orbit,) = both[:, np.asarray(orbits.stable)].T
+        assert orbits.phase_lag_deg is not None
+        both = np.asarray(orbits.drive_lockin_amplitude_nm), np.sin(np.radians(np.asarray(orbits.phase_lag_deg)))
+        (orbit,) = np.stack(both)[:, np.asarray(orbits.stable)].T
         readings.append(orbit)
     lines = np.polyfit(gaps, np.stack(readings), 1)
     return np.abs(np.stack(readings) - np.outer(gaps, lines[0]) - lines[1]).max(axis=0)
