@@ -152,13 +152,14 @@ def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> 
 
 
 def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface | None, start: State) -> None:
-    """Check what is known of a contact scene."""
+    """Check what is known of a contact scene before it is traced: operation by operation a batch would wait for it."""
+    if any(map(is_traced, jax.tree.leaves((scene, start)))):
+        return
     junction = find_junction(scene.interaction)
     require_junction(scene.interaction, junction.exists)
     gap, rate = to_gap(surface, response, start)
     leaves = has_just_left(surface, end_of_contact(scene.interaction), start.time_us, gap, rate)
-    outside = leaves | (gap > junction.forms_gap_nm)
-    if not (is_traced(outside) or bool(outside)):
+    if not (bool(leaves) or float(gap) > float(junction.forms_gap_nm)):
         raise ValueError(
             f"the start is inside the sample: the gap is {float(gap):.6g} nm, but must be above "
             f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; start higher"
