@@ -21,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 from afm_jax.checks import is_traced
-from afm_jax.compilation_cache import available_cores, quick_options
+from afm_jax.compilation_cache import available_cores, quick_options, wide_vectors
 
 LANES = 512
 """Lanes of a block that stay in the processor's cache; from 300 to 1000 differ little."""
@@ -101,12 +101,16 @@ def compiled_quickly(
         jitted = partial(jax.jit, function, static_argnames=static_argnames)
         # the compiler's options are known once JAX has started
         inside, outside = jitted(), cache(lambda: jitted(compiler_options=quick_options(level)))
+        # batches by `vmap` run long: compiled whole, with vectors of full width
+        batched = cache(lambda: jitted(compiler_options=wide_vectors() or None))
 
         @wraps(function)
         def called(*arguments: Any, **named: Any) -> Any:
+            tracers = [leaf for leaf in jax.tree.leaves((arguments, named)) if is_traced(leaf)]
             # inside a program everything is traced, also what is made of known numbers
-            traced = is_traced(jnp.asarray(0.0)) or any(map(is_traced, jax.tree.leaves((arguments, named))))
-            return (inside if traced else outside())(*arguments, **named)
+            if is_traced(jnp.asarray(0.0)) or any(is_traced(getattr(each, "val", each)) for each in tracers):
+                return inside(*arguments, **named)
+            return (batched() if tracers else outside())(*arguments, **named)
 
         vars(called)["outside"] = outside
         return called
