@@ -124,7 +124,8 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
-    return jax.tree.map(lambda row: row[0], iterate_map(scene, time_us, velocity_nm_per_us, 1, max_steps=max_steps))
+    seen, response, start = _free_start(scene, time_us, velocity_nm_per_us, max_steps)
+    return _in_lab(_next_impact(seen, start, max_steps=max_steps), response)
 
 
 @checked
@@ -156,19 +157,36 @@ def iterate_map(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
+    seen, response, start = _free_start(scene, time_us, velocity_nm_per_us, max_steps)
+    check_scalar("root_tolerance_us", root_tolerance_us)
+    check_parameter("root_tolerance_us", root_tolerance_us, "above 0")
+    tolerance = jnp.asarray(root_tolerance_us, start.time_us.dtype)
+    check_count("impacts", impacts)
+    return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
+
+
+def _free_start(
+    scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int
+) -> tuple[Scene, Surface | None, Departure]:
+    """Return scene, steady response to base and force, and the start without it, checked.
+
+    A start that is no flight is an outcome.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if something is an array, or the search has no step.
+    """
     require_float64(scene)
     impact_law_of(scene)
     for name, value in (("time_us", time_us), ("velocity_nm_per_us", velocity_nm_per_us)):
         check_scalar(name, value, "`iterate_batch` and `jax.vmap` take many")
-    check_scalar("root_tolerance_us", root_tolerance_us)
-    check_parameter("root_tolerance_us", root_tolerance_us, "above 0")
     check_count("max_steps", max_steps)
-    check_count("impacts", impacts)
     seen, response = seen_freely(scene)
-    numbers = (jnp.asarray(number, float) for number in (time_us, velocity_nm_per_us, root_tolerance_us))
-    time, velocity, tolerance = numbers
+    dtype = scene.platform.frequency_khz.dtype
+    time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
     start = Departure(time, None, velocity if response is None else velocity - response.velocity(time))
-    return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
+    return seen, response, start
 
 
 def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
@@ -185,6 +203,11 @@ def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
     return eqx.tree_at(
         lambda row: (row.velocity_before_nm_per_us, row.velocity_after_nm_per_us), impacts, (before, after)
     )
+
+
+@partial(jax.jit, static_argnames=("max_steps",))
+def _next_impact(scene: Scene, departure: Departure, *, max_steps: int) -> NextImpact:
+    return impact_after(scene, departure, Search(max_steps))
 
 
 def impact_after(
