@@ -73,20 +73,25 @@ def quick_options(level: int = 1) -> dict[str, Any] | None:
     Args:
         level: of optimisation; 0 halves the time to compile once more and doubles the time that programs run.
     """
-    options = _known_options()
-    return None if options is None else options | {"xla_backend_optimization_level": level}
+    options = _if_known("xla_cpu_use_fusion_emitters", "xla_backend_optimization_level")
+    return None if options is None else options | (wide_vectors() or {}) | {"xla_backend_optimization_level": level}
 
 
-_QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+_OPTIONS: dict[str, Any] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_prefer_vector_width": 512,
+}
 
 
 @lru_cache
-def _known_options() -> dict[str, Any] | None:
+def _if_known(*names: str) -> dict[str, Any] | None:
+    """Return these options; None on other devices, where the compiler does not know them, or XLA_FLAGS has chosen."""
     import jax  # noqa: PLC0415  # packages are imported without it
 
-    if jax.default_backend() != "cpu" or any(name in os.environ.get("XLA_FLAGS", "") for name in _QUICK):
+    options = {name: _OPTIONS[name] for name in names}
+    if jax.default_backend() != "cpu" or any(name in os.environ.get("XLA_FLAGS", "") for name in options):
         return None
-    options = _QUICK | wide_vectors()
     try:
         jax.jit(lambda x: x, compiler_options=options)(0.0)
     except jax.errors.JaxRuntimeError:
@@ -94,19 +99,9 @@ def _known_options() -> dict[str, Any] | None:
     return options
 
 
-@lru_cache
-def wide_vectors() -> dict[str, Any]:
+def wide_vectors() -> dict[str, Any] | None:
     """Return the option for vectors of 512 bits, where the processor has them; driven contacts take 0.9 of the time."""
-    import jax  # noqa: PLC0415  # packages are imported without it
-
-    wide = {"xla_cpu_prefer_vector_width": 512}
-    if jax.default_backend() != "cpu" or not any("avx512f" in line for line in _processor()):
-        return {}
-    try:
-        jax.jit(lambda x: x, compiler_options=wide)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return wide
+    return _if_known("xla_cpu_prefer_vector_width") if any("avx512f" in line for line in _processor()) else None
 
 
 def open_cache() -> Cache:

@@ -102,7 +102,7 @@ def compiled_quickly(
         # the compiler's options are known once JAX has started
         inside, outside = jitted(), cache(lambda: jitted(compiler_options=quick_options(level)))
         # batches by `vmap` run long: compiled whole, with vectors of full width
-        batched = cache(lambda: jitted(compiler_options=wide_vectors() or None))
+        batched = cache(lambda: jitted(compiler_options=wide_vectors()))
 
         @wraps(function)
         def called(*arguments: Any, **named: Any) -> Any:
