@@ -174,7 +174,8 @@ def calibrate(
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
     given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}
-    known = {name: given_value(name, one) for name, one in given.items() if one is not None}
+    read = {name: given_value(name, one) for name, one in given.items() if one is not None}
+    known = {name: (value, error or 0.0) for name, (value, error) in read.items()}
     if ("length_um" in known) != ("width_um" in known):
         raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
     sweep = replace(sweep, averages=averages or sweep.averages)
@@ -312,7 +313,7 @@ def _of_spectrum(sweep: Resonance) -> Calibration:
 
 
 def _springs(
-    found: Calibration, known: dict[str, tuple[float, float | None]], scale_error: float, *, static: bool
+    found: Calibration, known: dict[str, tuple[float, float]], scale_error: float, *, static: bool
 ) -> dict[str, CalibratedValue]:
     """Return the spring constants that a calibration supports; that by equipartition without error if contradicted.
 
@@ -328,17 +329,15 @@ def _springs(
     springs, mean = {}, found.mean_square_nm2
     who, wanted, share = "the instrument", found.sweep.instrument.get("spring_constant_n_per_m"), 0.1
     if "length_um" in known:
-        centre, errors = np.array([*read, *known.values()], float).T
+        centre, errors = np.array([*read, *known.values()]).T
         who, wanted = "Sader's method", sader(*centre)
-        share = float(
-            np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(np.nan_to_num(errors))])
-        )
+        share = float(np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(errors)]))
         springs["sader"] = _known_to(wanted, share)
     if mean is None or mean.standard_error is None:
         return springs
     warm, warm_error = known["temperature_k"]
     value = equipartition(mean.value, warm, static=static)
-    own = float(np.linalg.norm((mean.standard_error / mean.value, (warm_error or 0.0) / warm, 2.0 * scale_error)))
+    own = float(np.linalg.norm((mean.standard_error / mean.value, warm_error / warm, 2.0 * scale_error)))
     springs["equipartition"] = _known_to(value, own)
     apart = 0.0 if wanted is None else float(np.log(value / wanted))
     # neither is better than 5 %
