@@ -18,7 +18,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.derivatives import implicit_root, kept
 
 DEFAULT_MAX_STEPS = 2000
 DEFAULT_ROOT_TOLERANCE_US = 1e-13
@@ -88,6 +88,7 @@ def first_impact(
     if latest_us is not None:
         search = search._replace(latest_us=jnp.minimum(search.latest_us, lax.stop_gradient(latest_us)))
     found, ended = search.run(max_steps, jnp.asarray(root_tolerance_us, flight.velocity.dtype))
+    ended = kept(ended)
     hit = ended == Outcome.IMPACT
     root = implicit_root(flight_gap, jnp.where(hit, found, 0.0), flight)
     return FirstImpact(jnp.where(hit, root, 0.0), ended)

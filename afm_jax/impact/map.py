@@ -24,6 +24,7 @@ from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import Law, axes_of_one, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
+from afm_jax.solve.derivatives import recomputed
 from afm_jax.solve.lanes import map_in_blocks
 
 NEAR_GRAZING = 1e-3
@@ -207,7 +208,7 @@ def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
 
 @partial(jax.jit, static_argnames=("max_steps",))
 def _next_impact(scene: Scene, departure: Departure, *, max_steps: int) -> NextImpact:
-    return impact_after(scene, departure, Search(max_steps))
+    return recomputed(partial(impact_after, search=Search(max_steps)))(scene, departure)
 
 
 def impact_after(
@@ -303,7 +304,7 @@ def follow_impacts(
 
     def one_flight(tip: tuple[Departure, Array], _: None) -> tuple[tuple[Departure, Array], NextImpact]:
         start, flies = tip
-        impact = impact_after(scene, start, search, flies=flies)
+        impact = recomputed(partial(impact_after, search=search))(scene, start, flies=flies)
         outcome = jnp.where(flies, impact.outcome, Outcome.NOT_REACHED)
         goes_on = outcome == Outcome.IMPACT
         time = jnp.where(goes_on, impact.time_us, start.time_us)

