@@ -246,20 +246,22 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
     points, weights, cumulative = nodes_along(nodes, way.total_aj)
     at, drive = way.along(points), way.tip.drive
 
-    def again(_, state):
-        spent, _, _ = state
+    def again(spent: Array) -> tuple[Array, Array]:
         speed, time_slope = way.speed_and_time_slope(at.path_nm, at.available_aj - spent)
         spending = way.spending(at, speed, jnp.tensordot(cumulative, time_slope, axes=1))
-        return jnp.tensordot(cumulative, spending, axes=1), spent, spending
+        return jnp.tensordot(cumulative, spending, axes=1), spending
 
     guess = jnp.zeros_like(at.available_aj)
     if drive is not None:
         # of a push that does not change on the way
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
         guess = guess - way.tip.mass_ng * drive.push.position(way.begin_us) * (at.gap_nm - start_nm)
-    state, count = (guess, guess, guess), 0 if way.quiet else iterations
-    # few are written out in the program
-    spent, before, spending = lax.fori_loop(0, count, again, state, unroll=count <= _WRITTEN_OUT)
+    spent = before = spending = guess
+    if not way.quiet:
+        # few are written out in the program
+        unroll = iterations <= _WRITTEN_OUT
+        before = lax.fori_loop(1, iterations, lambda _, spent: again(spent)[0], guess, unroll=unroll)
+        spent, spending = again(before)
     kinetic = at.available_aj - spent
     speed, time_slope = way.speed_and_time_slope(at.path_nm, kinetic)
     lost = at.drag * speed

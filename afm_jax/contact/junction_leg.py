@@ -209,8 +209,7 @@ def _iterated(
 
     passing = weights - cumulative if half.pressing else cumulative
 
-    def improve(_, state):
-        turn, means, _, _ = state
+    def improve(turn: Array, means: Array) -> tuple[Array, Array, Array]:
         at = half.along(turn, points, means)
         moment = begin_us + jnp.tensordot(passing, at.time_slope, axes=1)
         rate = -at.y * at.over_y if half.pressing else at.y * at.over_y
@@ -219,10 +218,11 @@ def _iterated(
         total = jnp.tensordot(averages, g * at.slope, axes=1)
         mean = total[-1] / mean_depth_slope(turn, half.end)
         after = _turn_under(driven, half.end, level, mean, turn) if half.pressing else turn
-        return after, total[:-1] / mean_depth_slope(turn, at.s), means, mean
+        return after, total[:-1] / mean_depth_slope(turn, at.s), mean
 
-    begin = mean + jnp.zeros_like(points)
-    turn, means, before, mean = lax.fori_loop(0, setting.junction_iterations, improve, (turn, begin, begin, mean))
+    state = turn, mean + jnp.zeros_like(points)
+    turn, before = lax.fori_loop(1, setting.junction_iterations, lambda _, state: improve(*state)[:2], state)
+    turn, means, mean = improve(turn, before)
     at = half.along(turn, points, means)
     duration = jnp.tensordot(weights, at.time_slope, axes=1)
     change = jnp.abs((means - before) * twice * mean_depth_slope(turn, at.s)) / at.over_y**2

