@@ -9,7 +9,8 @@ from scipy import optimize
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, in_blocks, map_in_blocks, power_of_two
-from afm_jax.solve.newton import LinearisedRows, Newton, newton, newton_rows
+from afm_jax.solve.newton import newton
+from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
 from afm_jax.solve.quadrature import gauss_nodes, mean_matrix, series_tail
 
 VALUES = np.arange(1.0, 24.0)

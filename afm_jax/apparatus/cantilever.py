@@ -1,4 +1,9 @@
-"""The cantilever: a single mass on a spring, damped by air or not, with its free flight in closed form."""
+"""The cantilever: a single mass on a spring, damped by air or not, with its free flight in closed form.
+
+Takes free frequency in kHz, Q and mass in ng or spring constant in N/m. Gives Omega in rad/us, the acceleration of a
+free tip in nm/us^2 and its propagator: position in nm and velocity in nm/us a duration in us later (eq. 16 without
+contact).
+"""
 
 from typing import Any, NamedTuple
 

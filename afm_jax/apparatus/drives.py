@@ -1,5 +1,8 @@
 """What drives the tip besides the sample: the cantilever's base that moves, or a force on the tip.
 
+Takes amplitude (nm of the base, nN of the force), frequency in kHz and phase in degrees. Gives waves a cos(omega t +
+phi).
+
 A drive is one cosine, or two. With both drives eq. 16 reads m z'' + (m Omega/Q) z' + k z = F(D, D') + f(t) + k z_b(t):
 the base acts through the spring, the air damps the motion in the lab. What a detector sees of a tip on a moving base
 is the deflection z - z_b.

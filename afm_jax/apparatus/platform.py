@@ -1,4 +1,8 @@
-"""The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one."""
+"""The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one.
+
+Takes amplitude and offset in nm, frequency in kHz and a ramp in nm/us. Gives position z_p in nm, velocity in nm/us and
+bounds of both and of the acceleration at a time in us (eq. 2).
+"""
 
 from abc import abstractmethod
 from collections.abc import Iterable

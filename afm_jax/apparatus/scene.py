@@ -1,4 +1,7 @@
-"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides."""
+"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides.
+
+Takes these parts, checks that they fit together, and gives what all of it repeats by: the drive's period in us.
+"""
 
 import math
 from typing import Any, ClassVar, NamedTuple

@@ -1,5 +1,7 @@
 """The surface that a free tip sees: the platform, less what the other drives make of the tip without it.
 
+Takes a scene; gives s as a `Surface` (position in nm, velocity in nm/us at a time in us) and p (`surface_of`).
+
 Under a force f(t) and a base motion z_b(t) a free tip has the steady response p(t) = Re sum H(omega) a exp(i(omega t +
 phi)), a = f/m + Omega^2 z_b, H = 1/(Omega^2 - omega^2 + i omega Omega/Q). What is left of it, y = z - p, flies freely,
 and the gap is y - s with the surface s = z_p - p: offset, ramp and cosines once more. So whatever drives a scene,

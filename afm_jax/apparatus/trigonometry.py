@@ -1,5 +1,7 @@
 """Sine and cosine together, as polynomials that vectorise.
 
+Takes an angle in rad; gives both, differentiable.
+
 XLA's float64 sine and cosine on a CPU are scalar library calls of 10-14 ns an element; the pair below costs about
 2 ns in a vectorised loop, which is a factor of four in the impact map. Accuracy: 1 unit in the last place of 1, plus
 the rounding of the argument itself.

@@ -1,5 +1,8 @@
 """The way of a tip through the liquid bridge, free or driven, with the gap D as independent variable.
 
+Takes a tip (`Driven`), its kinetic energy in aJ or its state at one end; gives energy, time in us and what was
+dissipated in aJ at the other end (eqs. 10 to 13 and 16).
+
 Where the bridge is crossed monotonically the gap can replace time. With the kinetic energy K = m w^2/2, w the size of
 the gap's rate, the potential U of the static forces and the spring, and the energy S that is spent, K + U + S is the
 energy at the start (eq. 16, integrated once). The static forces, which vary most, leave the equation, S is integrated,

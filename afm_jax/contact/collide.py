@@ -1,5 +1,8 @@
 """Collisions of free tips with a sample at rest: rebound speed, delay and losses for an approach speed (section IV).
 
+Takes a contact, approach speeds in nm/us and a mass in ng; gives speeds in nm/us, delay and time in contact in us,
+energies in aJ, gaps in nm and an outcome (eqs. 10 to 16).
+
 One `collision` is the approach through the bridge, the junction, and the retraction. `collide` takes batches of speeds
 and contacts, in few steps and again in many for the few tips that need it; `capture_speed` is the root of the energy at
 the end; `collisions` makes a table of them.

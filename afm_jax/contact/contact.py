@@ -1,5 +1,8 @@
 """A contact: forces over a gap, a solid contact, and the gaps at which the bridge forms and breaks.
 
+Takes the parameters, units in their names (eqs. 10 to 15); gives potential in aJ, force in nN, stiffness in nN/nm and
+damping in nN us/nm at a gap in nm.
+
 `Contact` holds the parameters; `Bridge` is what is computed from them once, for many evaluations of potential and
 damping.
 """

@@ -1,5 +1,7 @@
 """Equation of motion of a tip in contact (eq. 16), in the gap and its rate, phase by phase.
 
+Takes contact, cantilever and surface; gives the rates of a `ContactState`: nm, nm/us, us, aJ.
+
 With D = y - s(t), y the free cantilever's coordinate and s the surface it moves over, eq. 16 reads
 D'' = F(D, D')/m - Omega^2 D - (Omega/Q) D' + q(t), with q = -(s'' + (Omega/Q) s' + Omega^2 s) all that depends on time.
 Within a phase everything is smooth. In the junction the root s of the elastic contact takes the place of the gap, and

@@ -1,5 +1,7 @@
 """Where the solid junction forms, D_on, and where it breaks, D_off, from a contact's parameters.
 
+Takes a contact; gives a `Junction`: gaps in nm, force in nN, stiffness in nN/nm, hysteresis in aJ (eqs. 10 to 15).
+
 An approaching tip changes from the bridge's force curve to the JKR curve where force and stiffness of both are equal.
 The force of the bridge at a gap fixes the point of the JKR curve that bears it (closed form), so that the stiffness is
 one equation for the gap, which is D_on; the point of the JKR curve fixes where the curve sits on the gap axis, depth =

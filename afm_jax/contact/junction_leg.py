@@ -1,5 +1,8 @@
 """The way of a tip through the junction, free or driven: to the turning point, and from there to the fold.
 
+Takes a tip (`Driven`) and its energy in aJ or state where the junction forms; gives energy or state, time in us and
+deepest gap in nm where it breaks (eqs. 15 and 16).
+
 In the root s of the elastic contact (sqrt(A) for JKR) work and depth are polynomials, and the fold, where the contact
 breaks, is smooth. With s = turn - y^2, turn the root at the turning point, and w the gap's rate,
 

@@ -1,5 +1,7 @@
 """The parameters of a contact and its effects, written once: scene files, options, fits and reports take theirs here.
 
+Gives names, units, ranges and meanings; eqs. 10 to 15 say what the parameters do.
+
 Without JAX, so that `--help` needs none.
 """
 

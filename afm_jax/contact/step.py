@@ -1,5 +1,7 @@
 """One step in time of a tip in contact, and the search for the events that end a phase.
 
+Takes a `TipInContact` (nm, nm/us, us) and the end of the simulation in us; gives the tip one trial later.
+
 The equation of motion (eq. 16, `Driven.rates`) is smooth within a phase. A phase ends where x, the gap in the bridge
 and the root s in the junction, meets a threshold:
 

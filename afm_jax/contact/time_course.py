@@ -1,5 +1,8 @@
 """One impact of a free tip in time: gap, velocity, phase and force on its way through the contact.
 
+Takes a contact, an approach speed in nm/us and a mass in ng; gives columns of time in us, gap in nm, velocity in nm/us
+and force in nN (eqs. 10 to 16).
+
 The passages through bridge and junction are computed as in `collide`, with the gap or the root s in place of time, and
 given at their Gauss nodes; these crowd where the tip is slow, so that times are not equally spaced.
 """

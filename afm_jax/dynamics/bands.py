@@ -1,5 +1,8 @@
 """Errors of orbits, exponents, verdicts and basins that follow from the errors of a scene's parameters.
 
+Takes special points, diagrams or starts, and a fit's law or errors of parameters; gives standard errors and bands in
+the units of what they are of.
+
 A special point obeys G(x, p; a) = 0, the closing conditions and its test function, for parameters a that are known up
 to a covariance C. By the implicit function theorem it moves by d(x, p)/da = -(dG/d(x, p))^-1 dG/da, and the parameter
 where it lies has the variance (dp/da) C (dp/da)^T. What motions come to is no smooth function of a: it is computed

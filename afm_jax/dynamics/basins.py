@@ -1,5 +1,8 @@
 """Basins of attraction: the motion on which each start ends.
 
+Takes a scene and a grid of starts (phase in rad, rebound speed in nm/us); gives the number of the attractor of each,
+and the attractors (map: eqs. 2 to 6).
+
 A sample of starts is followed for long; the motions that it reaches are the attractors. Then every start is followed
 until it is at a point of an orbit, is held, or flies away, and drops out; the rest is followed further and sorted like
 the sample. Distances are in drive phase (rad) and velocity over beta omega.

@@ -1,5 +1,8 @@
 """Bifurcation diagrams: the motions on which a tip settles while a parameter is ramped up, and down.
 
+Takes a scene and values of a parameter in its unit; gives phases in rad, speeds in nm/us and m, N at each value (map:
+eqs. 2 to 6).
+
 A ramp carries the drive phase and the rebound speed of the tip from value to value, so that hysteresis shows; it is a
 long sequence. Many lanes compute it at once, each a stretch of neighbouring values that it ramps from its own start.
 Every lane goes on into the stretches behind it, as long as its motion differs from the one that is there already. Where

@@ -1,5 +1,7 @@
 """Stable single-impact orbits of many scenes: their orders and peak amplitudes.
 
+Takes a scene and ranges of two parameters in their units; gives orders N and amplitudes in nm (eqs. 8 and 9).
+
 For every scene and every order N the roots of the closing condition are found; where there is one the orbit is read and
 judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude).
 """

@@ -1,5 +1,8 @@
 """Orbits of m contacts in N drive periods: closed by Newton's method on the simulated map from departure to departure.
 
+Takes a scene with a contact, m and N; gives orbits: times in us, speeds in nm/us, amplitudes in nm, multipliers (eq.
+16).
+
 First guesses are the orbits of the law with delay that comes closest to the contact, unstable ones included, and what
 tips come to that are simulated for a while. The map's Jacobian is the forward derivative of the simulation, so that a
 loop is closed to rounding and its multipliers are exact.
@@ -41,7 +44,7 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import gap_of_departure, rebound_of_leaving
 from afm_jax.solve.arclength import EquationsAt, PointInPlane
 from afm_jax.solve.lanes import in_blocks
-from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
+from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 9

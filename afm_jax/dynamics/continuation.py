@@ -1,5 +1,8 @@
 """Orbits followed through a parameter by pseudo-arclength, round folds, with the points where their nature changes.
 
+Takes a scene and the range of a parameter in its unit; gives branches and special points: phases in rad, speeds in
+nm/us, amplitudes in nm, multipliers (eqs. 8 and 9).
+
 The unknowns of a closed loop, followed by the parameter as a fraction of its range, lie on a curve (`curves`). Orbits
 are looked for at some values of the parameter, the curves through them are followed, and on these the special points
 are located (`special_points`), which are followed through a second parameter in turn.

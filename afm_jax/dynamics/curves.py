@@ -1,5 +1,7 @@
 """Curves of closed loops in one or two parameters, followed by pseudo-arclength round folds.
 
+Takes a family and ranges of parameters in their units; gives points: unknowns of the family and parameters.
+
 A point of a curve is the unknowns of a loop (`LoopFamily`) followed by the parameters as fractions of their ranges. A
 step along the tangent is a guess, and Newton's method closes the loop again in the plane across the tangent. Where a
 test function of the family changes its sign between two points the root is located by a bracketed search.

@@ -1,5 +1,7 @@
 """Lyapunov exponents of the impact map: how fast neighbouring motions part, from the exact Jacobians.
 
+Takes a scene and values of a parameter; gives exponents per impact, without unit, and in 1/us (Jacobians: eqs. 5 to 8).
+
 Of the map's two exponents the larger is the growth of a tangent vector, the orthogonal factor of a QR decomposition in
 two dimensions, and their sum the mean of ln |det|. Once a motion repeats, after m impacts, they are ln |multipliers|/m
 of the Jacobian over one repetition. A tip that comes to rest on the platform and is let go by it, or stays for good,

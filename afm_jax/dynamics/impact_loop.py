@@ -1,5 +1,8 @@
 """The closing conditions of an orbit of m impacts in N drive periods, all its flights at once, and what it is good for.
 
+Takes a scene with a law, phases in rad and coordinates in nm/us; gives residuals, without unit, their slopes, and
+readings in nm, nm/us, us (eqs. 2 to 8).
+
 Unknowns are the drive phase at which the tip arrives at each impact and the coordinate of that impact
 (`Law.speeds`), in which the law is smooth up to capture. Every flight has to end at height and velocity of the next
 arrival: 2 m smooth equations, with no search for a first impact in them, that go on through folds and past a graze.

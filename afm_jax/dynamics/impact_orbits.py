@@ -1,5 +1,8 @@
 """Loops of impacts of a law, and orbits of m impacts in N drive periods: found from many starts, sorted, polished.
 
+Takes a scene with a law, m and N; gives orbits: phases in rad, speeds in nm/us, amplitudes in nm, multipliers (eqs. 2
+to 8).
+
 Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
 Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.
 """
@@ -41,7 +44,8 @@ from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.arclength import EquationsAt, PointInPlane
 from afm_jax.solve.derivatives import largest, value_and_slopes
 from afm_jax.solve.lanes import in_blocks
-from afm_jax.solve.newton import Newton, newton
+from afm_jax.solve.newton import newton
+from afm_jax.solve.newton_rows import Newton
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 BLOCK = 64

@@ -1,5 +1,7 @@
 """Many tips followed from impact to impact at once: the engine behind exponents, bifurcation diagrams and basins.
 
+Times are in us, velocities in nm/us, phases in rad; the map is that of eqs. 2 to 6, or eq. 16 for contacts.
+
 `follow` takes `Tips`, each at the beginning of a flight, and returns them some impacts later with a `Record` of the
 last ones. A time is a number of whole drive periods plus a remainder in us within one period, so that the drive's phase
 stays accurate in long motions.

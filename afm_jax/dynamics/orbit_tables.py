@@ -1,5 +1,8 @@
 """The output of `afm-jax orbits`: orbits of one scene as rows of plain numbers and tables, and why there is none.
 
+Takes orbits; gives keys and columns that end in their units (rad, nm, nm/us, us, degrees). The equations are in
+`impact/orbits` (eq. 9) and `impact_orbits`.
+
 An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several impacts lists all of them, the first
 one's numbers besides (`orbit_facts`).
 """

@@ -1,5 +1,7 @@
 """Where motions begin: tips of many scenes, in the frame in which every drive is a sample that moves with one cosine.
 
+States are us, nm and nm/us; the frame is that of eq. 2.
+
 `sample_driven` takes scenes into that frame and checks that they repeat; `batch_and_tips` gives their tips there, from
 a start in the lab or on the stable single-impact orbit of the order nearest to resonance.
 """

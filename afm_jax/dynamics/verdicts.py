@@ -1,4 +1,7 @@
-"""How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample."""
+"""How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample.
+
+Takes the times in us and velocities in nm/us of the last departures; gives m, N and a `Verdict` for each tip.
+"""
 
 import enum
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """The closing condition of a single-impact orbit, one scalar equation for the approach speed, and all its roots.
 
+Takes cantilever, platform, law and order N; gives coordinates (nm/us) and phases (rad) of all orbits.
+
 Equation 9 asks for the impact phase. Read the other way round it has no poles and nothing special at resonance: for an
 assumed approach speed u the law gives the rebound speed w and the delay tau, and the two conditions that the flight of
 duration N T - tau ends where the next one begins are *linear* in a = cos(omega t_out), b = sin(omega t_out). Every root
@@ -25,7 +27,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.lasting_impact import corrected, middle_of_contact, speeds_of_lasting_impact
 from afm_jax.impact.law import Impact, ImpactLaw, Speeds
-from afm_jax.solve.newton import Newton, newton
+from afm_jax.solve.newton import newton
+from afm_jax.solve.newton_rows import Newton
 from afm_jax.solve.polynomial_roots import real_roots
 
 NEAR_DOUBLE = 1e-3

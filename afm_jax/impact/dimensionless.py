@@ -1,4 +1,8 @@
-"""An impact oscillator in units of its own: natural frequency 1, mass 1."""
+"""An impact oscillator in units of its own: natural frequency 1, mass 1.
+
+Takes omega, zeta, r, gap and force of x'' + 2 zeta x' + x = f cos(omega t), without units; gives a scene in us, nm and
+ng whose numbers are these.
+"""
 
 from jaxtyping import ArrayLike
 

@@ -1,5 +1,7 @@
 """The switching condition (eq. 3): the first time after an impact at which the tip meets the platform again.
 
+Takes a flight: start in us, velocity in nm/us, gap and level in nm; gives its duration in us and an `Outcome`.
+
 The search cannot miss a root. With a gap g >= 0, its slope g' and a bound |g''| <= M over the whole flight, the gap
 stays positive for at least h = (g' + sqrt(g'^2 + 2 M g))/M, so a step of h never passes a root; it leaves the surface
 by itself after an impact (g = 0, g' > 0) and closes in quadratically. M = Omega sqrt(E) sqrt(1 + 1/Q^2) + beta omega^2,

@@ -1,5 +1,8 @@
 """The linearised impact map, written out: eqs. 5, 7 and 8, and their damped and delayed generalisation.
 
+Takes times in us, positions in nm and velocities in nm/us; gives derivatives of impact time and velocity by those
+before, in these units.
+
 Two layers: formulas of scalars (the paper's eqs. 5, 7 and 8 as printed, and `flight_jacobian`, `impact_jacobian` that
 hold with damping, viscous loss and delay), and `map_jacobian`, which finds the next impact of a scene and chains them.
 `afm-jax verify` compares all of them with automatic differentiation. An impact that lasts, the delay with its

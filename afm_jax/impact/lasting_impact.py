@@ -1,5 +1,7 @@
 """An impact that lasts: what the platform's motion, the spring and the air do to the tip while it is in contact.
 
+Takes speeds in nm/us and delay in us of a free tip, cantilever and surface; gives those of the lasting impact.
+
 A law tells rebound speed w and delay of a free tip that arrives with speed u at a sample at rest. On a moving platform,
 in air, the contact is that of Hertz with a pull. With the Hertz time tau = a u^(-1/5), the indentation x, and the
 acceleration g + j t that spring, air and platform give the tip relative to the platform (positive: away from the

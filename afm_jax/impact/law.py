@@ -1,5 +1,8 @@
 """The impact law: how fast the tip leaves for how fast it came, and how late.
 
+Takes approach speeds in nm/us, r, epsilon in nm^2/us^2 and c in nm/us, or columns of a table; gives rebound speeds in
+nm/us and delays in us (eqs. 4 and 6).
+
 A law is a function from the approach speed to the rebound speed and the collision delay, with a capture speed up to
 which the tip stays. Two kinds: the formula of eq. 6 with the viscous loss that the liquid bridge adds (`ImpactLaw`),
 u_out^2 = r^2 u_in^2 - c u_in - epsilon, and a table of speeds, measured, fitted or computed (`TabulatedLaw`). All

@@ -1,5 +1,8 @@
 """One table of a law: what an impact does to a free tip on a sample at rest, over a coordinate smooth through capture.
 
+Takes w^2 in nm^2/us^2 and delays in us at the knots; gives speeds in nm/us and the delay in us at a coordinate, without
+unit.
+
 The coordinate s counts knots. With the capture speed u_c and v_k = 3 sinh(h k) nm/us at knot k, the approach speed is
 u = sqrt(u_c^2 + v^2), so that an orbit keeps its coordinate while u_c moves. The rebound speed and the delay are
 

@@ -1,5 +1,7 @@
 """The impact map of a law: from the departure of the tip after one impact to that after the next (eqs. 2-4 and 6).
 
+Takes a scene, time in us and velocity in nm/us after an impact; gives those after the next, and an `Outcome`.
+
 `next_impact` is the map of one tip, `iterate_map` a sequence of impacts, `iterate_batch` such sequences of many tips.
 Below them, for any surface that the tip sees: `impact_after` ends one flight. Simulations of law scenes, the search for
 orbits of many impacts and the sequences here all go from flight to flight by it.

@@ -1,5 +1,7 @@
 """Single-impact orbits, one impact in N drive periods (eq. 9): which there are, whether they last, and their readings.
 
+Phases are in rad (drive) and degrees (readings), speeds in nm/us, amplitudes in nm, delays in us.
+
 `single_impact_orbits` takes a scene with a law and returns every orbit of an order N. The roots of the closing
 condition (`closure`) are approach speeds; `orbit_state` makes of a root the motion, the flight between two impacts;
 `is_admissible` says whether the flight passes through the platform, `is_stable` judges by the map's Jacobian (eq. 8);

@@ -1,5 +1,8 @@
 """An approach curve: amplitude and lag of a driven tip against the sample's height, approach and retract.
 
+Takes a driven scene and heights in nm; gives amplitudes in nm, phase lags in degrees, energies in aJ and an outcome for
+each height (the lock-in integral of `observe`).
+
 At each height the whole scene is followed in time until it repeats. From there the sample moves to the next height, by
 so little in a drive period that the motion follows: an approach keeps its branch as far as it goes, and hysteresis
 shows. A tip that is captured on the way, as laws with adhesion capture slow ones, begins anew at the height after.

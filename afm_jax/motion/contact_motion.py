@@ -1,5 +1,7 @@
 """A contact scene in time (eq. 16): closed-form flight to the bridge, through the contact, and so on to the end.
 
+Takes a scene with a contact and a start (us, nm, nm/us in the lab); gives a `Simulation`.
+
 A leg is one integral through the whole bridge, or through the whole junction, with a coordinate in place of time: the
 gap D in the bridge, s = sqrt(A) of JKR's normalised contact radius A (eq. 15) in the junction. Thresholds are met
 without a search, and the speed follows from the energy. A leg holds (is accurate) for a tip that passes without turning

@@ -1,5 +1,8 @@
 """Long motions, followed piece by piece until they are over, have settled, or are enough.
 
+Takes a scene, a start (us, nm, nm/us) and a duration in us; gives the joined `Simulation` and whether it has settled.
+Equations: those of `simulate`, which follows each piece.
+
 A piece ends at a departure, and the next one continues from there, so that no contact is cut in two and counted twice.
 """
 

@@ -1,5 +1,7 @@
 """Law scenes in time: the impact map over whatever surface the tip sees, and rests on it, to the end of a duration.
 
+Takes a scene with a law and a start (us, nm, nm/us in the lab); gives a `Simulation` (eqs. 2 to 4 and 6).
+
 A round of the loop (`follow_rounds`) is a flight, the impact that ends it and the rest after it, written into one row.
 All shapes are fixed; a batch goes on until its last tip has ended. The tip rests on the surface for as long as the
 surface pushes it.

@@ -1,4 +1,8 @@
-"""The output of `afm-jax simulate`: the JSON object, a summary in lines, contacts and the tip as columns."""
+"""The output of `afm-jax simulate`: the JSON object, a summary in lines, contacts and the tip as columns.
+
+Takes a simulation and its observables; gives `MotionTable`, whose keys and columns end in their units (nm, nm/us, us,
+nN, aJ, degrees). The formulas are in `observe`.
+"""
 
 import math
 from collections.abc import Mapping

@@ -1,5 +1,7 @@
 """What an instrument reads of a simulated motion: amplitudes, phases, times, forces, energies.
 
+Takes a scene and its simulation; gives `Observables`, units in their names.
+
 `Observables` is the table: a row is a quantity, its name with the unit, its meaning, its formula (a function of a
 `MotionWindow`) and why a scene may not have it. Its names are the JSON keys of `afm-jax simulate` and the columns of
 sweeps, so that a new quantity is a new row here.

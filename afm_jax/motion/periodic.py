@@ -1,4 +1,8 @@
-"""The periodic motion that a scene comes to: Newton's method on the map of one response period ends its transient."""
+"""The periodic motion that a scene comes to: Newton's method on the map of one response period ends its transient.
+
+Takes a scene, a start (us, nm, nm/us) and how long to follow it in us; gives an `Orbit`, its state in these units, or
+the reason why there is none. The equation is x - F(x) = 0, F the motion of one response period.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,7 +19,7 @@ from afm_jax.contact.junction import ContactPhase, find_junction, require_juncti
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.trajectory import DensePath, flights_of
-from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
+from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
 
 _ORBIT_PIECE = 50.0
 """Drive periods after which a motion is looked at: is it near an orbit?"""

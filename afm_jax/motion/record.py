@@ -1,5 +1,7 @@
 """What a simulation hands out: its contacts in order, its last state, and how it ended.
 
+Takes and gives times in us, gaps and heights in nm, velocities in nm/us, energies in aJ.
+
 A tip on its way, of a law or through resolved contacts, is a `FollowedTip`: its contacts are written down there, round
 by round of one loop (`follow_rounds`).
 

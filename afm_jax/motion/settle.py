@@ -1,5 +1,8 @@
 """Whether a motion has settled, on what, and the window that is read of it.
 
+Takes a scene and its simulation; gives a `Settled` (m, N, the distance that is left, without unit) and a `Window` in
+us.
+
 The criterion is on the sequence of departures (drive phase, velocity), not on a number of periods: it repeats after m
 contacts in N drive periods, and what a geometric extrapolation leaves of the distance between repetitions is small.
 """

@@ -1,4 +1,8 @@
-"""A scene followed in time, whatever its interaction: free, from impact to impact of a law, or through contacts."""
+"""A scene followed in time, whatever its interaction: free, from impact to impact of a law, or through contacts.
+
+Takes a scene, a start (us, nm, nm/us in the lab) and a duration in us; gives a `Simulation` (eqs. 2 to 6 with a law,
+eq. 16 with a contact).
+"""
 
 import math
 from collections.abc import Callable

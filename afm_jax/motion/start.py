@@ -1,4 +1,8 @@
-"""Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says."""
+"""Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says.
+
+Takes a scene, and maybe a phase in degrees, a height in nm and a velocity in nm/us; gives a `State`: us, nm, nm/us in
+the lab (orbits by eq. 9).
+"""
 
 import equinox as eqx
 import jax

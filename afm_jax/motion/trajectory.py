@@ -1,5 +1,8 @@
 """Dense output: where the tip is at any time of a simulation, worked out on request.
 
+Takes a scene, its simulation and times in us; gives height and gap in nm, their rates in nm/us, force in nN and phase
+of the contact then (eq. 16).
+
 A simulation keeps its contacts alone. A `DensePath` is made of pieces in the order of time, each with a state from
 which the tip is followed: flights, in closed form; resolved contacts, which are integrated once more when a time within
 them is asked for, a place inside a step being one step of order 8 from its beginning; rests on the surface of a law.

@@ -1,4 +1,7 @@
-"""The contact of a scene file: its parameters by name, what they may be, and the contact that they make."""
+"""The contact of a scene file: its parameters by name, what they may be, and the contact that they make.
+
+Takes numbers with their units in the names (eqs. 10 to 15); gives a `Contact`, and back.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

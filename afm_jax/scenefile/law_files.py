@@ -1,5 +1,7 @@
 """Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
 
+Takes a path; gives a `TabulatedLaw`: speeds in nm/us, delays in us, mass in ng (eq. 6 stands beside the table).
+
 Three kinds, recognized by their content: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
 with a column of approach speeds, one of rebound speeds, and maybe one of delays, named as below. A tip that
 is captured leaves at 0, or has a blank cell where a column `captured` says true (as of `collide --out`):

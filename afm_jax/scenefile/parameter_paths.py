@@ -1,5 +1,7 @@
 """Parameters of a scene by their paths in its file: ranges of them as text, and scenes with other values of them.
 
+Takes texts and values in the units of the scene file; gives scenes.
+
 `platform.reduced_frequency=0.4:4.4:1000` is a path and a range. A path names a number of the scene file, or the reduced
 frequency omega/2 Omega of a drive; where the cantilever's frequency changes, the drives keep theirs in kHz. What base
 or force make of the free tip, `force.free_amplitude_nm`, sets their amplitude, which stays when other numbers change.

@@ -1,5 +1,7 @@
 """The paper's scenes by name, and with what its figures vary as arguments (they can be batched by `vmap`).
 
+Gives scenes: kHz, nm, ng, nm^2/us^2 (eqs. 2 and 6; section IV: eqs. 10 to 16).
+
 The reduced frequency is n = omega/2 Omega; the free frequency is 90 kHz throughout. Sections II and III leave air
 damping out; section IV, with the resolved contact, has Q = 40. Figures 4 to 7 show the contact alone,
 `Contact.paper()`. `load_scene` makes one scene of a name.

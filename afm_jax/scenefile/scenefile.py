@@ -1,5 +1,7 @@
 """Scenes as TOML files, in and out; the loop is exact.
 
+Takes a path or text; gives a `Scene`, units in the names of the keys (eqs. 2, 6, 10 to 16), and writes one.
+
 ```toml
 [cantilever]
 frequency_khz = 90

@@ -1,5 +1,7 @@
 """The tables of a scene file: their keys and types are checked, and every error says file, table and key.
 
+Takes what TOML holds; gives numbers in the units that the keys name.
+
 Where somebody wrote a key that there is not, the message advises the one to use instead.
 """
 

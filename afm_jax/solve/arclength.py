@@ -1,5 +1,7 @@
 """A point of a curve of solutions in a plane across the curve, and the tangent there (pseudo-arclength continuation).
 
+Takes f with its derivatives, a guess and a normal, all without units; gives the point and the tangent.
+
 n equations f in n + 1 unknowns x have curves of solutions. A step along the tangent is a guess; Newton's method for f
 and the plane's equation, normal . (x - guess) = 0, comes back to the curve. It passes folds, where a parameter turns
 back.
@@ -11,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
+from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
 
 _CLOSING = Newton(rounds=12, step_tolerance=1e-11)
 

@@ -1,5 +1,7 @@
 """Derivatives that need care: of a root, of the largest value, of a number that is absent, and of a batch of tips.
 
+Takes functions of arrays in whatever units; gives their results with derivatives.
+
 A root x(p) of f(x, p) = 0 that some search (such as `halved`) has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls
 itself for the root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well;
 a Newton step behind `stop_gradient` would give wrong Hessians. So would `jax.custom_jvp` as soon as the root is found

@@ -1,5 +1,7 @@
 """Batches of lanes (one tip, orbit or scene each): in blocks of one size, and the few hard lanes again.
 
+Takes work and trees of arrays with an axis of lanes, in whatever units; gives the trees of results.
+
 Blocks keep memory flat and the processor's cache in use, and one compiled program serves batches of every size: what is
 missing in the last block is filled up with copies of the last lane, whose results are dropped.
 

@@ -1,4 +1,8 @@
-"""Levenberg's and Marquardt's damped least squares between bounds, and what a minimum is worth: covariance, chi2."""
+"""Levenberg's and Marquardt's damped least squares between bounds, and what a minimum is worth: covariance, chi2.
+
+Takes residuals in units of their errors with a Jacobian; gives the place where the sum of squares is smallest: (J^T J +
+d diag J^T J) step = -J^T r, d the damping.
+"""
 
 import math
 from collections.abc import Callable

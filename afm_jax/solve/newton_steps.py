@@ -1,4 +1,7 @@
-"""A few steps of Newton's method inside a program, to a simple root of one equation that a scan has come close to."""
+"""A few steps of Newton's method inside a program, to a simple root of one equation that a scan has come close to.
+
+Takes f with its derivative and a guess, in whatever unit; gives x after so many steps x - f/f'.
+"""
 
 from collections.abc import Callable
 from typing import Any

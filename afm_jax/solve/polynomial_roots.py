@@ -1,5 +1,7 @@
 """All real roots of a polynomial in an interval, none missed: between critical points a polynomial is monotone.
 
+Takes coefficients and an interval, without units; gives roots in slots, and which slots hold one.
+
 The critical points are the roots of the derivative, found in the same way, down to the quadratic with its formula. The
 search vectorises over `vmap`, and needs no eigenvalues of companion matrices, which run on a CPU alone and lose half
 the digits at double roots.

@@ -1,5 +1,7 @@
 """Gauss-Legendre quadrature on [0, 1]: integrals over the whole, up to each node, and the series through the values.
 
+Takes numbers of nodes and values at them, in whatever unit; gives nodes, weights and matrices.
+
 Values f_j at the n nodes x_j stand for the polynomial sum_k c_k P_k(2 x - 1) through them, c_k = (2 k + 1) sum_j w_j
 P_k(2 x_j - 1) f_j. What is linear in f, such as its integral up to a node, is thereby a matrix of numbers.
 """

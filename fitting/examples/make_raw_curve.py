@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
 
 from afm_jax.whole_files import write_whole
 from fitting.instruments.lag import free_lag_deg
@@ -78,8 +76,12 @@ _FINE = 20001
 
 
 @cache
-def _shapes() -> tuple[PchipInterpolator, PchipInterpolator]:
+def _shapes() -> tuple[Any, Any]:
     """Return the amplitude over the free one against height, and the lag against that."""
+    # 0.3 s, which commands that name the example need not wait for
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+
     height = np.linspace(_HEIGHTS[0], _HEIGHTS[-1] + 5.0 * _ROUNDED_NM, _FINE)
     # beyond the nearest height 1 nm per nm goes on
     deeper = np.maximum(height - _HEIGHTS[-1], 0.0) / FREE_NM

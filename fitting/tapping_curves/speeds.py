@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
+from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ, effective_mass_ng
 from fitting.tapping_curves.along import EnergyFunctions
 from fitting.tapping_curves.curve import Given, Instrument, Mask, Rows, TappingCurve, motion_of

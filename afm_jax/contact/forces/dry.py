@@ -1,5 +1,7 @@
 """The elastic contact of a dry sphere and a plane: Hertz's, and with an attraction that does not change (DMT).
 
+Takes radius, modulus and a0 with their units in the names; gives loads in nN and depths in nm.
+
 From the gap a0 inwards the load is K sqrt(R) delta^(3/2) - P, delta = a0 - D the depth, K the reduced modulus as in JKR
 (K sqrt(R) delta^(3/2) is Hertz's law). P is what the forces outside pull with where the solids meet: H R/(6 a0^2) by
 van der Waals' force (Derjaguin, Muller and Toporov). So the force is continuous, and the contact breaks where it has

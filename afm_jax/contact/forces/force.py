@@ -1,5 +1,7 @@
 """What every force, the sum of several, and every elastic contact have in common.
 
+Takes gaps in nm; gives forces in nN, stiffnesses in nN/nm, potentials in aJ, damping in nN us/nm.
+
 A force is a function of the gap D between tip and sample in nm and of its rate in nm/us; attraction is negative. A
 static force does not depend on the rate and has a potential; a dissipative one is -damping(D) dD/dt and has none.
 

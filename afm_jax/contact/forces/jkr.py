@@ -1,5 +1,8 @@
 """The adhesive elastic contact of Johnson, Kendall and Roberts, in Maugis' normalised variables (eq. 15).
 
+Takes w, R and K with their units in the names; gives loads, depths and works in these units, and the units in nN, nm
+and aJ.
+
 With s = sqrt(A), the root of the normalised contact radius, load and depth are polynomials:
 P = s^6 - sqrt(6) s^3, Delta = s^4 - (2 sqrt(6)/3) s, in units of pi w R and of (pi^2 w^2 R / K^2)^(1/3). The contact
 breaks under displacement control at the fold s = 6^(-1/6), where dP/dDelta is infinite; s itself stays smooth there.

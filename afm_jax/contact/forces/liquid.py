@@ -1,5 +1,7 @@
 """Forces of the liquid bridge: capillary attraction, structural repulsion, viscous drag (eqs. 10 to 13).
 
+Takes gaps in nm; gives forces in nN (static), their potentials in aJ, and damping in nN us/nm.
+
 The liquid is in equilibrium with its vapour, whose humidity sets the meniscus' radius of curvature (eq. 11). The
 structural repulsion of the confined liquid is averaged over its oscillations; the viscous force resists squeezing and
 stretching.

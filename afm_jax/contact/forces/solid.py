@@ -1,5 +1,7 @@
 """Forces between the solids: the repulsion of their atomic cores (eq. 14), and the van der Waals attraction.
 
+Takes gaps in nm; gives forces in nN and potentials in aJ.
+
 The attraction is that of a sphere and a plane at gaps small against the radius, not retarded (Hamaker 1937).
 """
 
