@@ -70,6 +70,19 @@ for call in {calls}:
     assert all(line.endswith(" set()") for line in found), found
 
 
+def test_energies_of_a_curve_need_neither_jax_nor_the_maker_of_the_example():
+    curve = Path(fitting.__file__).parent / "examples" / "tapping_resonance.csv"
+    code = f"""
+import sys
+from afm_jax.cli.main import main
+try:
+    main(["tapping", {str(curve)!r}, "--json"])
+except SystemExit:
+    print("loaded", {{"jax", "scipy.interpolate"}} & set(sys.modules))
+"""
+    assert python(code).splitlines()[-1] == "loaded set()"
+
+
 def test_exports_are_what_the_modules_define():
     for package, names in ((afm_jax, set(dir(afm_jax)) - {"__version__"}), (fitting, dir(fitting))):
         assert all(getattr(package, name).__name__ == name for name in names)

@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
-from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
+from afm_jax.solve.derivatives import absent, by_tangents, halved, implicit_root, largest, recomputed
 from afm_jax.solve.lanes import again_for, again_for_the_open, in_blocks, map_in_blocks, power_of_two
 from afm_jax.solve.newton import newton
 from afm_jax.solve.newton_rows import LinearisedRows, Newton, newton_rows
@@ -216,6 +216,21 @@ def test_derivatives_of_a_batch_are_found_forward_and_transposed(small: bool):  
     curvature = jax.vmap(jax.hessian(lambda shared: jnp.sum(wave(shared, lanes))))(jnp.asarray([0.3, 0.7]))
     expected = [np.sum(2.0 * lanes**2 * np.cos(2.0 * at * lanes)) for at in (0.3, 0.7)]
     np.testing.assert_allclose(curvature, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("how", [recomputed, lambda work: work])
+def test_reverse_mode_computes_work_again_from_roots_and_arguments_alone(how):
+    def one_root(square: jax.Array, _: None) -> tuple[jax.Array, None]:
+        low, _ = halved(lambda x: x * x < square, 0.0 * square, square + 1.0, rounds=60)
+        root = implicit_root(lambda x, square: x * x - square, low, square)
+        return jnp.exp(jnp.log(jnp.tan(jnp.arctan(root)))), None
+
+    value, pullback = jax.vjp(lambda square: jax.lax.scan(how(one_root), square, length=5)[0], jnp.asarray(3.0))
+    np.testing.assert_allclose(value, 3.0 ** (1.0 / 32.0), rtol=1e-13)
+    np.testing.assert_allclose(pullback(jnp.asarray(1.0))[0], 3.0 ** (1.0 / 32.0 - 1.0) / 32.0, rtol=1e-12)
+    # what the forward pass leaves: the root and the argument of each step
+    left = sum(np.size(leaf) for leaf in jax.tree.leaves(pullback) if jnp.issubdtype(leaf.dtype, jnp.floating))
+    assert (left <= 11) == (how is recomputed)
 
 
 def test_an_absent_number_has_an_absent_derivative_where_it_is_asked_for():
