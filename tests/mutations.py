@@ -49,6 +49,9 @@ _EDITS = {
     "test_poincare.py::test_every_end_of_a_flight_is_said": {
         "overlap of late instead of early starts": "overlap = jnp.maximum({- => }delay, 0.0)"
     },
+    "test_solve.py::test_reverse_mode_computes_work_again_from_roots_and_arguments_alone[recomputed]": {
+        "roots searched for again on the way back": "save_only_these_names({_FOUND => })"
+    },
     "test_jacobian.py::test_written_and_automatic_jacobians_have_twelve_digits[start0-delayed]": {
         "flight's Jacobian without the start's shift": "acceleration2 * {(time_by_time - 1.0) => time_by_time}",
         "impact's Jacobian with the delay turned round": "1.0 {+ => -} delay_slope * acceleration_in",

@@ -24,7 +24,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected
 from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
-from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
+from afm_jax.impact.orbits import orbit_state, readings_of, steady_orbits
 from fitting.infer.fit import fit
 from fitting.infer.result import FitResult
 from fitting.simulated.experiment import with_noise
@@ -73,7 +73,7 @@ def _predicted(impact: TabulatedImpact, quality_factor, frequency_khz, free_nm, 
         slot = jnp.argmax(jnp.where(orbits.steady, orbits.place.coordinate, -jnp.inf))
         place = jax.tree.map(lambda part: part[slot], orbits.place)
         state = orbit_state(place, problem)
-        _, amplitude, phase = amplitudes(place, problem)
+        _, amplitude, phase = readings_of(orbit_state(place, problem), problem)
         ratio = frequency_khz / 90.0
         size, lag = detected(amplitude, phase, free_nm, ratio, quality_factor, base=False)
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * state.speeds.delay)

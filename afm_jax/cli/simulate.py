@@ -9,12 +9,12 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.cli.approach_curve import NOISE, PHASE_NOISE_DEG, approach
 from afm_jax.cli.command import Output, later
+from afm_jax.cli.motion_table import MotionTable
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Orders, Positive, Share
 from afm_jax.columns import csv_columns
 from afm_jax.motion.follow import follow_long
-from afm_jax.motion.motion_table import MotionTable
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.settle import Window

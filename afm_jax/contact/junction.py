@@ -30,6 +30,7 @@ from afm_jax.contact.forces.dry import Hertz
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.lanes import for_each_lane
 from afm_jax.solve.newton_steps import newton_steps
 
 SMALLEST_GAP_NM = 0.01
@@ -137,9 +138,7 @@ def end_of_contact(contact: Contact) -> Float[Array, "..."]:
     Args:
         contact: the contact; its parameters are numbers, or arrays with one axis.
     """
-    if contact.bridge_breaks_nm.ndim:
-        return jax.vmap(end_of_contact)(contact)
-    return jnp.maximum(contact.bridge_breaks_nm, find_junction(contact).breaks_gap_nm)
+    return jnp.maximum(contact.bridge_breaks_nm, for_each_lane(find_junction, contact).breaks_gap_nm)
 
 
 def _excess_stiffness(log_gap: Float[Array, "..."], model: Tangent) -> Float[Array, "..."]:

@@ -90,7 +90,6 @@ def first_impact(
     if latest_us is not None:
         search = search._replace(latest_us=jnp.minimum(search.latest_us, lax.stop_gradient(latest_us)))
     found, ended = search.run(max_steps, jnp.asarray(root_tolerance_us, flight.velocity.dtype))
-    ended = kept(ended)
     hit = ended == Outcome.IMPACT
     root = implicit_root(flight_gap, jnp.where(hit, found, 0.0), flight)
     return FirstImpact(jnp.where(hit, root, 0.0), ended)
@@ -220,7 +219,7 @@ class _Search(NamedTuple):
             jnp.where(duration >= self.latest_us, Outcome.NO_FURTHER_IMPACT, Outcome.STEP_LIMIT),
         )
         ended = jnp.where(inside, Outcome.DELAY_EXCEEDS_FLIGHT, ended)
-        return -duration, jnp.where(finite & leaving, ended, Outcome.INVALID_START).astype(jnp.int32)
+        return -duration, kept(jnp.where(finite & leaving, ended, Outcome.INVALID_START).astype(jnp.int32))
 
     def _first_step(self) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """Return a duration in us before which there is no impact, and whether the tip is in the platform there."""

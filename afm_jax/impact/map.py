@@ -17,7 +17,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
@@ -76,11 +75,6 @@ class Departure(NamedTuple):
     time_us: Float[Array, "..."]
     gap_nm: Float[Array, "..."] | None
     velocity_nm_per_us: Float[Array, "..."]
-
-    def position_nm(self, surface: Platform | Surface) -> Float[Array, "..."]:
-        """Return the height of the tip in nm over a surface."""
-        height = surface.position(self.time_us)
-        return height if self.gap_nm is None else height + self.gap_nm
 
 
 class Search(NamedTuple):

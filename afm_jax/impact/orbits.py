@@ -6,7 +6,7 @@ Phases are in rad (drive) and degrees (readings), speeds in nm/us, amplitudes in
 condition (`closure`) are approach speeds; `orbit_state` makes of a root the motion, the flight between two impacts;
 `is_admissible` says whether the flight passes through the platform, `is_stable` judges by the map's Jacobian (eq. 8);
 at the end stands what an experiment reads of the flight: peak height, lock-in amplitude and phase. Fits take the same
-functions for impacts of every kind (`coordinates_of_roots`, `steady_orbits`, `amplitudes`).
+functions for impacts of every kind (`coordinates_of_roots`, `steady_orbits`, `readings_of`).
 """
 
 from typing import Any, NamedTuple
@@ -249,7 +249,7 @@ class SteadyOrbits(NamedTuple):
 def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
     """Return the readings of height and deflection in the lab, under the names of `SingleImpactOrbits`."""
     cantilever, order = problem.cantilever, problem.order
-    peak, amplitude, angle = _readings(state, problem)
+    peak, amplitude, angle = readings_of(state, problem)
     if frame.response is None:
         return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
 
@@ -338,7 +338,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     def judged(place: OrbitPlace, found: Bool[Array, ""]) -> Any:
         state = orbit_state(place, problem)
         of_map = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, state.flight)
-        return is_admissible(found, state, problem) & contracts(*of_map), _readings(state, problem)
+        return is_admissible(found, state, problem) & contracts(*of_map), readings_of(state, problem)
 
     steady, readings = jax.vmap(judged)(roots.place, roots.found)
     return SteadyOrbits(roots.place, steady, roots.near_fold, readings)
@@ -355,13 +355,8 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
     return jax.tree.map(lambda leaf: leaf[fastest], states), jnp.any(orbits.steady)
 
 
-def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
-    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
-    return _readings(orbit_state(place, problem), problem)
-
-
 @jax.jit
-def _readings(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
+def readings_of(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of an orbit's free motion."""
     return jnp.stack([peak_amplitude(problem.cantilever, state.flight), *_lockin(state, problem)])
 
@@ -378,8 +373,8 @@ def _lockin(
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
         nu = platform.angular_frequency / (1.0 if at_drive else order)
         depth = depth_of_impact(impact, approach, rebound, middle, cantilever, nu)
-    settings: Any = {"delayed": impact.delayed, "indentation": depth, "at_drive": at_drive}
-    return lockin(cantilever, platform, state.flight, order, **settings)
+    ends = state.flight
+    return lockin(cantilever, platform, ends, order, delayed=impact.delayed, indentation=depth, at_drive=at_drive)
 
 
 def trace_and_determinant(

@@ -28,7 +28,7 @@ from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
-from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
+from afm_jax.impact.map import Departure, NextImpact, Search, flight_from, impact_after
 from afm_jax.motion.record import (
     ContactKind,
     FollowedTip,
@@ -201,7 +201,7 @@ def _final(seen: Scene, response: Surface | None, departure: Departure, outcome:
     surface = seen.platform
     held = outcome == MotionOutcome.HELD
     time = jnp.where(held | (outcome == MotionOutcome.FINISHED), until, departure.time_us)
-    height = departure.position_nm(surface)
+    height = flight_from(seen, departure).position
     position, velocity = seen.cantilever.propagator(time - departure.time_us)(height, departure.velocity_nm_per_us)
     gap, rate = to_gap(surface, None, State(time, position, velocity))
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
+from afm_jax.impact.orbits import orbit_state, readings_of, steady_orbits
 from fitting.predict.orbit import Local, Row, platform_and_cantilever, shown
 
 
@@ -72,5 +72,6 @@ def searched(
 def read_at(coordinate: Float[Array, ""], law: ImpactLaw, local: Local, row: Row, drive: str) -> Float[Array, " 3"]:
     """Return the readings of the orbit whose impact has a coordinate; the other arguments as of `searched`."""
     cantilever, platform = platform_and_cantilever(local, row, drive)
-    seen = amplitudes(OrbitPlace(coordinate, jnp.zeros(())), OrbitProblem(cantilever, platform, law, row.order))
-    return shown(seen, local, row, platform, drive)
+    problem = OrbitProblem(cantilever, platform, law, row.order)
+    state = orbit_state(OrbitPlace(coordinate, jnp.zeros(())), problem)
+    return shown(readings_of(state, problem), local, row, platform, drive)
