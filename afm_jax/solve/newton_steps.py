@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-_WRITTEN_OUT = 4
-
 
 def newton_steps(
     value_and_slope: Callable[[Array], tuple[Array, Array]],
@@ -19,6 +17,8 @@ def newton_steps(
     steps: int,
     low: ArrayLike = -jnp.inf,
     high: ArrayLike = jnp.inf,
+    *,
+    unroll: bool = False,
 ) -> Float[Array, "..."]:
     """Return the root of f that so many steps x - f/f' lead to, or of each of several equations.
 
@@ -30,10 +30,10 @@ def newton_steps(
     Args:
         value_and_slope: f and its derivative at x, of x's shape; where the derivative is 0 no step is made.
         guess: near the root.
-        steps: how many. More than four are a loop, because the program is compiled for every use; of one tip in
-            contact, a step in time with a loop of four takes 1.14 times as long.
+        steps: how many.
         low: the root is held above it.
         high: and below it.
+        unroll: write the steps out: longer to compile than a loop, quicker to run where f is short.
     """
 
     def step(_: Any, x: Array) -> Array:
@@ -41,4 +41,4 @@ def newton_steps(
         flat = slope == 0.0
         return jnp.clip(x - jnp.where(flat, 0.0, value / jnp.where(flat, 1.0, slope)), low, high)
 
-    return lax.fori_loop(0, steps, step, guess, unroll=steps <= _WRITTEN_OUT)
+    return lax.fori_loop(0, steps, step, guess, unroll=unroll)
