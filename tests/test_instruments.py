@@ -15,7 +15,8 @@ import fitting.instruments.recording as recording_module
 from afm_jax.cli.main import main
 from afm_jax.saved import as_json
 from fitting import TableError, read_curve, read_curves, read_table
-from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
+from fitting.examples import RAW_CURVE, RAW_CURVE_OPTIONS
+from fitting.examples.make_raw_curve import FREE_NM, NM_PER_VOLT, raw_curve, true_energy_aj
 from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
@@ -449,7 +450,7 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: py
 def test_tapping_takes_a_curve_that_was_read_and_its_file_alike():
     of_file, of_curve = (
         as_json(tapping(source, law=False, **options))
-        for source, options in ((EXAMPLE, OPTIONS), (read_curve(EXAMPLE, **OPTIONS), {}))
+        for source, options in ((RAW_CURVE, RAW_CURVE_OPTIONS), (read_curve(RAW_CURVE, **RAW_CURVE_OPTIONS), {}))
     )
     assert of_file["valid"]
     assert of_file["branches"] == of_curve["branches"]
@@ -501,7 +502,7 @@ def test_the_scale_by_the_slope_is_known_as_well_as_it_says(tmp_path: Path, poin
     pulls = []
     for seed in range(20):
         text = raw_curve(points, seed=seed, noise=noise).text
-        scale = read_curve(saved(tmp_path, text), **OPTIONS).known["nm_per_volt"]
+        scale = read_curve(saved(tmp_path, text), **RAW_CURVE_OPTIONS).known["nm_per_volt"]
         assert scale.error is not None
         pulls.append((float(scale.value) - NM_PER_VOLT) / scale.error)
     # on the safe side where rows are many; with the scatter about the line alone it was 2.5, 1.1 and 5.6
@@ -519,7 +520,7 @@ def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
 
 
 def test_the_example_gives_the_scale_and_the_energies_that_it_was_made_with():
-    scale = read_curve(EXAMPLE, **OPTIONS).known["nm_per_volt"]
+    scale = read_curve(RAW_CURVE, **RAW_CURVE_OPTIONS).known["nm_per_volt"]
     assert scale.error is not None
     # through all rows in contact it would be 150 nm/V
     assert abs(float(scale.value) - NM_PER_VOLT) < 3.0 * scale.error < 5.0

@@ -11,7 +11,7 @@ from afm_jax.cli.session import Session, add_note
 from afm_jax.cli.values import CurveNumber, Share, option_of
 from afm_jax.saved import as_json
 from afm_jax.whole_files import check_plain
-from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
+from fitting.examples import RAW_CURVE, RAW_CURVE_OPTIONS
 from fitting.tapping_curves.measured import measured
 from fitting.tapping_curves.tapping import energies_of_table, with_law
 from fitting.tapping_curves.together import together
@@ -55,8 +55,8 @@ def energy_of_taps(  # noqa: PLR0913
     if example == bool(curve_files):
         raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
     if example:
-        stated = {name: value for name, value in OPTIONS.items() if reading[name] in {None, ""}}
-        path = EXAMPLE.relative_to(Path.cwd()) if EXAMPLE.is_relative_to(Path.cwd()) else EXAMPLE
+        stated = {name: value for name, value in RAW_CURVE_OPTIONS.items() if reading[name] in {None, ""}}
+        path = RAW_CURVE.relative_to(Path.cwd()) if RAW_CURVE.is_relative_to(Path.cwd()) else RAW_CURVE
         words = " ".join(f"{option_of(name)} '{value}'" for name, value in stated.items())
         add_note(f"The example is simulated; as if it were measured: afm-jax tapping {path} {words}")
         curve_files, reading = (path,), reading | stated

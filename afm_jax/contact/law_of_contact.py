@@ -1,7 +1,7 @@
 """The law that a contact amounts to: rebound speed and delay of its free collisions, in parameters and in tables.
 
-Takes a contact and a mass in ng; gives laws: rebound speed in nm/us and delay in us of an approach speed in nm/us (eq.
-6).
+Takes a contact and a mass in ng; gives laws: rebound speed in nm/us and delay in us of an approach speed in nm/us
+(eq. 6).
 
 Five functions make a law of collisions: the formula closest to their rebound speeds (`law_of_contact`), the formula
 closest to their delays (`delay_of_contact`), both roughly and at once where a guess will do (`approximate_law`), a

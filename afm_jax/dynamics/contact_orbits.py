@@ -1,7 +1,7 @@
 """Orbits of m contacts in N drive periods: closed by Newton's method on the simulated map from departure to departure.
 
-Takes a scene with a contact, m and N; gives orbits: times in us, speeds in nm/us, amplitudes in nm, multipliers (eq.
-16).
+Takes a scene with a contact, m and N; gives orbits: times in us, speeds in nm/us, amplitudes in nm, multipliers
+(eq. 16).
 
 First guesses are the orbits of the law with delay that comes closest to the contact, unstable ones included, and what
 tips come to that are simulated for a while. The map's Jacobian is the forward derivative of the simulation, so that a

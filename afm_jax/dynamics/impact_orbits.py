@@ -1,7 +1,7 @@
 """Loops of impacts of a law, and orbits of m impacts in N drive periods: found from many starts, sorted, polished.
 
-Takes a scene with a law, m and N; gives orbits: phases in rad, speeds in nm/us, amplitudes in nm, multipliers (eqs. 2
-to 8).
+Takes a scene with a law, m and N; gives orbits: phases in rad, speeds in nm/us, amplitudes in nm, multipliers
+(eqs. 2 to 8).
 
 Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
 Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.

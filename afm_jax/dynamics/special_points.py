@@ -1,7 +1,7 @@
 """Points of a branch where the nature of its orbit changes, located, and followed through two parameters.
 
-Takes a curve and its family; gives points: the parameter in its unit, m, N, multipliers (fold +1, doubling -1 of eq.
-8's matrix; grazing, capture).
+Takes a curve and its family; gives points: the parameter in its unit, m, N, multipliers (fold +1, doubling -1 of
+eq. 8's matrix; grazing, capture).
 
 A special point is where a test function changes its sign between two points, located by Brent's method along the curve.
 In two parameters the closing equations together with the test function are followed.

@@ -12,27 +12,18 @@ E = pi k A (A0 |gamma| sin lag - s A/Q) follows, gamma = 1 - s^2 + i s/Q.
 import sys
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
 
 from afm_jax.whole_files import write_whole
+from fitting.examples import RAW_CURVE
 from fitting.instruments.lag import free_lag_deg
 
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
-EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
-OPTIONS: dict[str, Any] = {
-    "columns": "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
-    "drive": "force",
-    "nm_per_volt": "slope",
-    "spring_constant_n_per_m": "44 +- 4",
-    "quality_factor": "230 +- 5",
-    "free_frequency_khz": "344.60 +- 0.01",
-}
-"""What its reader knows of the instrument: the arguments of `read_curves` for the example."""
 _HEIGHTS = (0.0, 30.0, 31.5, 34.0, 37.0, 40.0, 41.0, 41.5, 42.1, 42.7, 43.3)
 _RATIOS = (1.0, 1.0, 0.995, 0.98, 0.957, 0.936, 0.922, 0.897, 0.856, 0.812, 0.767)
 """Amplitude over the free one at heights of the sample in nm: a plateau, then 1 nm per nm."""
@@ -76,12 +67,8 @@ _FINE = 20001
 
 
 @cache
-def _shapes() -> tuple[Any, Any]:
+def _shapes() -> tuple[PchipInterpolator, PchipInterpolator]:
     """Return the amplitude over the free one against height, and the lag against that."""
-    # 0.3 s, which commands that name the example need not wait for
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415
-    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
-
     height = np.linspace(_HEIGHTS[0], _HEIGHTS[-1] + 5.0 * _ROUNDED_NM, _FINE)
     # beyond the nearest height 1 nm per nm goes on
     deeper = np.maximum(height - _HEIGHTS[-1], 0.0) / FREE_NM
@@ -145,4 +132,4 @@ def raw_curve(
 
 
 if __name__ == "__main__":
-    write_whole(sys.argv[1] if len(sys.argv) > 1 else EXAMPLE, raw_curve().text)
+    write_whole(sys.argv[1] if len(sys.argv) > 1 else RAW_CURVE, raw_curve().text)
